@@ -1,0 +1,7 @@
+"""arm5dof: massively parallel training of vision-guided robot arms in JAX and MJX."""
+
+from arm5dof import xla
+
+xla.configure()
+
+__version__ = "0.1.0"

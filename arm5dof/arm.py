@@ -1,0 +1,245 @@
+"""`Arm`: any serial arm in MJCF, whatever its number of joints.
+
+The arm's joints are those on the way from the world to the body that carries the end-effector site. Whatever else the
+model holds (a gripper, a table, free objects) is left alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from arm5dof import files
+from arm5dof.errors import UserError
+
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+class Link(NamedTuple):
+    """A constant transform, then a joint that turns about or slides along z."""
+
+    slides: bool
+    rotation: np.ndarray
+    offset: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A serial arm. Angles in radians (slides in metres), positions in metres in the world frame.
+
+    Joint vectors `q` have shape (dof,), in order from base to tip; batches are made with `jax.vmap`.
+    """
+
+    mj_model: mujoco.MjModel
+    mjx_model: mjx.Model
+    joints: np.ndarray
+    """Joint ids, (dof,)."""
+    qpos: np.ndarray
+    """Where the joints stand in `qpos`, (dof,)."""
+    dofs: np.ndarray
+    """Where they stand in `qvel`, (dof,)."""
+    actuators: np.ndarray
+    """Ids of the joints' position actuators, (dof,); -1 where a joint has none."""
+    site: int
+    """Id of the end-effector site."""
+    lower: np.ndarray
+    upper: np.ndarray
+    """Joint limits, (dof,)."""
+    rest: np.ndarray
+    """The model's `qpos0`, every coordinate of the scene, (nq,)."""
+    chain: tuple[Link, ...]
+    """What stands between the joints, (dof + 1,): the last leads from the last joint to the site."""
+    reach: float
+    """An upper bound on the distance between the first joint and the end effector, metres."""
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return len(self.joints)
+
+    @property
+    def home(self) -> np.ndarray:
+        """The middle of every joint's range, (dof,)."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def origin(self) -> np.ndarray:
+        """The first joint's anchor in the world frame, (3,)."""
+        data = mujoco.MjData(self.mj_model)
+        mujoco.mj_kinematics(self.mj_model, data)
+        return data.xanchor[self.joints[0]].copy()
+
+    def make_data(self, q: jax.Array) -> mjx.Data:
+        """Simulation data at joint positions `q`, everything else at rest. Call it inside `jit`: eager MJX data
+        carries other types than a step returns, and the next call would compile again."""
+        qpos = jnp.asarray(self.rest, jnp.float32).at[self.qpos].set(q)
+        data = mjx.make_data(self.mjx_model).replace(qpos=qpos)
+        return mjx.kinematics(self.mjx_model, data)
+
+    def forward(self, q: jax.Array) -> jax.Array:
+        """Position of the end-effector site, (..., 3), at joint positions `q` (..., dof). Differentiable.
+
+        The same function of the same MJCF as `mjx.kinematics`, carried out on one point alone, from tip to base and
+        component by component: the critic calls it in every update, where it is some 50 times faster.
+        """
+        x, y, z = (jnp.full(q.shape[:-1], c, q.dtype) for c in self.chain[-1].offset)
+        for k in reversed(range(self.dof)):
+            link, value = self.chain[k], q[..., k]
+            if link.slides:
+                z = z + value
+            else:
+                c, s = jnp.cos(value), jnp.sin(value)
+                x, y = c * x - s * y, s * x + c * y
+            point = (x, y, z)
+            x, y, z = (_row(*constants, point) for constants in zip(link.rotation, link.offset, strict=True))
+        return jnp.stack([x, y, z], axis=-1)
+
+    def end_effector(self, data: mjx.Data) -> jax.Array:
+        """Position of the end-effector site, (3,)."""
+        return data.site_xpos[self.site]
+
+    def joint_positions(self, data: mjx.Data) -> jax.Array:
+        """Where the joints are, (dof, 3)."""
+        return data.xanchor[self.joints]
+
+    def to_joints(self, action: jax.Array) -> jax.Array:
+        """Map actions in [-1, 1] to joint positions inside the limits; (..., dof) to (..., dof)."""
+        return self.home + action * (self.upper - self.lower) / 2
+
+    def to_action(self, q: jax.Array) -> jax.Array:
+        """The inverse of `to_joints`."""
+        return (q - self.home) * 2 / (self.upper - self.lower)
+
+    def sample(self, key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:
+        """Joint positions drawn uniformly inside the limits, shape + (dof,), float32."""
+        return self.to_joints(jax.random.uniform(key, (*shape, self.dof), minval=-1.0, maxval=1.0))
+
+
+def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
+    """Load an arm from an MJCF file (the user's, or one that ships in `mjcf/`) or from an `MjSpec`.
+
+    Raises `UserError` if the file is missing or broken, the site does not exist, or the joints between the world and
+    the site are not a chain of limited hinges and slides.
+    """
+    model = _compile(source)
+    names = [model.site(i).name for i in range(model.nsite)]
+    if site not in names:
+        raise UserError(f"the model has no site {site!r} to use as end effector; it has: {', '.join(names) or 'none'}")
+    site_id = names.index(site)
+
+    path: list[int] = []
+    body = model.site_bodyid[site_id]
+    while body:
+        path.insert(0, body)
+        body = model.body_parentid[body]
+    ids = np.array([j for b in path for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])])
+    if not len(ids):
+        raise UserError(f"no joint moves the site {site!r}: it hangs on the world")
+    for j in ids:
+        name = model.joint(j).name
+        if model.jnt_type[j] not in (HINGE, SLIDE):
+            raise UserError(f"joint {name!r} is neither a hinge nor a slide: only serial arms of those can be trained")
+        if not model.jnt_limited[j]:
+            raise UserError(f'joint {name!r} has no limits: give it range="LOWER UPPER" in the MJCF')
+
+    chain = _chain(model, path, site_id)
+    slides = np.abs(model.jnt_range[ids][model.jnt_type[ids] == SLIDE]).max(-1, initial=0).sum()
+    return Arm(
+        mj_model=model,
+        mjx_model=mjx.put_model(model),
+        joints=ids,
+        qpos=model.jnt_qposadr[ids],
+        dofs=model.jnt_dofadr[ids],
+        actuators=np.array([_position_actuator(model, j) for j in ids]),
+        site=site_id,
+        lower=model.jnt_range[ids, 0].copy(),
+        upper=model.jnt_range[ids, 1].copy(),
+        rest=model.qpos0.copy(),
+        chain=chain,
+        reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + slides),
+    )
+
+
+def _chain(model: mujoco.MjModel, path: list[int], site: int) -> tuple[Link, ...]:
+    """Everything between one joint's frame and the next, folded into one constant transform each. A joint's frame
+    has its origin in the anchor and its z axis along the joint's axis."""
+    links: list[Link] = []
+    rotation, offset = np.eye(3), np.zeros(3)
+
+    def move(by_rotation: np.ndarray, by_offset: np.ndarray) -> None:
+        nonlocal rotation, offset
+        rotation, offset = rotation @ by_rotation, offset + rotation @ by_offset
+
+    for body in path:
+        move(np.eye(3), model.body_pos[body])
+        move(_matrix(model.body_quat[body]), np.zeros(3))
+        first = model.body_jntadr[body]
+        for j in range(first, first + model.body_jntnum[body]):
+            slides = bool(model.jnt_type[j] == SLIDE)
+            align, anchor = _z_towards(model.jnt_axis[j]), model.jnt_pos[j]
+            zero = np.array([0, 0, model.qpos0[model.jnt_qposadr[j]]])
+            move(align, anchor)
+            move(np.eye(3), -zero) if slides else move(_about_z(-zero[2]), np.zeros(3))
+            links.append(Link(slides, _clean(rotation), _clean(offset)))
+            rotation, offset = align.T, -align.T @ anchor
+    move(np.eye(3), model.site_pos[site])
+    return (*links, Link(False, np.eye(3), _clean(offset)))
+
+
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
+def _about_z(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def _z_towards(axis: np.ndarray) -> np.ndarray:
+    """A rotation that takes the z axis to `axis`, a unit vector."""
+    quaternion = np.empty(4)
+    mujoco.mju_quatZ2Vec(quaternion, axis)
+    return _matrix(quaternion)
+
+
+def _clean(constants: np.ndarray) -> np.ndarray:
+    """Constants with rounding errors about 0 and +-1 removed, so that the terms vanish from the program."""
+    nearest = np.round(constants)
+    return np.where(np.abs(constants - nearest) < 1e-14, nearest, constants)
+
+
+def _row(rotation: np.ndarray, offset: float, point: tuple[jax.Array, ...]) -> jax.Array:
+    """One component of a transformed point; terms that are zero for this arm are left out of the program."""
+    terms = [float(r) * p for r, p in zip(rotation, point, strict=True) if r]
+    return sum(terms[1:], start=terms[0] + float(offset))
+
+
+def _position_actuator(model: mujoco.MjModel, joint: int) -> int:
+    """Id of the actuator that servoes a joint's position, or -1."""
+    for a in range(model.nu):
+        on_joint = model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and model.actuator_trnid[a, 0] == joint
+        if on_joint and model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE):
+            return a
+    return -1
+
+
+def _compile(source: str | Path | mujoco.MjSpec) -> mujoco.MjModel:
+    if isinstance(source, mujoco.MjSpec):
+        return source.compile()
+    path = files.find("mjcf", source)
+    if path is None:
+        known = ", ".join(files.shipped("mjcf", ".xml"))
+        raise UserError(f"no MJCF file {str(source)!r}: give a path, or one of those shipped: {known}")
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise UserError(f"MuJoCo cannot read {path}: {error}") from None

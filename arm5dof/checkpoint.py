@@ -1,0 +1,141 @@
+"""Checkpoints with orbax: complete, atomic, verified when read.
+
+A checkpoint has two items, `networks` (all that answering needs) and `training` (optimisers, replay buffer,
+environments, random keys, counters), and a record of names, shapes and digests by which damage and foreign
+checkpoints are recognised. Nothing in it is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from arm5dof.ddpg import Networks, Training
+from arm5dof.errors import UserError
+
+T = TypeVar("T")
+KEEP = 2
+
+
+class Checkpoints:
+    """The checkpoints of one run, in one folder, numbered by the steps taken."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        logging.getLogger("absl").setLevel(logging.ERROR)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=KEEP, enable_async_checkpointing=False, cleanup_tmp_directories=True, create=True
+        )
+        with _as_user_error(f"cannot open the checkpoints in {folder}"):
+            self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+
+    @property
+    def latest(self) -> int | None:
+        """Steps at the newest complete checkpoint, or None."""
+        return self._manager.latest_step()
+
+    def save(self, training: Training) -> None:
+        """Write a checkpoint. It counts once it is complete; until then, and if it fails, the last one does."""
+        items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
+        record = {name: _describe(leaves) for name, leaves in items.items()}
+        failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, go on with --resume"
+        with _as_user_error(failure):
+            self._manager.save(
+                int(training.steps),
+                args=ocp.args.Composite(
+                    record=ocp.args.JsonSave(record),
+                    **{name: ocp.args.StandardSave(leaves) for name, leaves in items.items()},
+                ),
+            )
+            self._manager.wait_until_finished()
+
+    def restore(self, like: Training) -> Training:
+        """The newest checkpoint, bit for bit. `like` gives shapes and types (`jax.eval_shape` of `DDPG.init`)."""
+        rest = self._read("training", like.replace(networks=None))
+        return rest.replace(networks=self.restore_networks(like.networks))
+
+    def restore_networks(self, like: Networks) -> Networks:
+        """The networks of the newest checkpoint."""
+        return self._read("networks", like)
+
+    def _read(self, item: str, like: T) -> T:
+        step = self.latest
+        if step is None:
+            raise UserError(f"{self.folder} holds no complete checkpoint yet")
+        where = self.folder / str(step)
+        template = {name: _storable(leaf) for name, leaf in _named(like).items() if leaf.size}
+        abstract = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in template.items()}
+        with _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one"):
+            record = self._manager.restore(step, args=ocp.args.Composite(record=ocp.args.JsonRestore())).record[item]
+            expected = {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in abstract.items()}
+            if expected != record["leaves"]:
+                raise UserError(
+                    f"the checkpoint {where} does not fit the run's config.toml: it is of another run or version"
+                )
+            restored = self._manager.restore(
+                step, args=ocp.args.Composite(**{item: ocp.args.StandardRestore(abstract)})
+            )[item]
+            if _describe(restored)["sha256"] != record["sha256"]:
+                raise ValueError("its contents do not match their digest")
+        return _rebuild(like, restored)
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _storable(leaf: Any) -> Any:
+    """PRNG keys as the integers they are made of; works on arrays and on their shapes."""
+    if not _is_key(leaf):
+        return leaf
+    abstract = isinstance(leaf, jax.ShapeDtypeStruct)
+    return jax.eval_shape(jax.random.key_data, leaf) if abstract else jax.random.key_data(leaf)
+
+
+def _leaves(tree: Any) -> dict[str, np.ndarray]:
+    """A pytree as named arrays; empty arrays, which tensorstore cannot write, are left out."""
+    return {name: np.asarray(_storable(leaf)) for name, leaf in _named(tree).items() if leaf.size}
+
+
+def _rebuild(like: T, leaves: dict[str, Any]) -> T:
+    def leaf(path: Any, template: Any) -> jax.Array:
+        if not template.size:
+            return jnp.zeros(template.shape, template.dtype)
+        value = jnp.asarray(leaves[jax.tree_util.keystr(path, simple=True, separator=".")])
+        return jax.random.wrap_key_data(value) if _is_key(template) else value
+
+    return jax.tree_util.tree_map_with_path(leaf, like)
+
+
+def _describe(leaves: dict[str, Any]) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for name in sorted(leaves):
+        digest.update(np.ascontiguousarray(leaves[name]).tobytes())
+    shapes = {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in leaves.items()}
+    return {"leaves": shapes, "sha256": digest.hexdigest()}
+
+
+@contextlib.contextmanager
+def _as_user_error(message: str) -> Iterator[None]:
+    """Orbax and tensorstore raise many types for a bad file or a full disk; to the user they are one."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        reason = (str(error) or type(error).__name__).strip().splitlines()[0][:200]
+        raise UserError(f"{message} ({reason})") from error

@@ -1,0 +1,289 @@
+"""DDPG as the paper's Algorithm 1, in pure functions: `init`, `act`, `update`, `collect`, `epoch`.
+
+Every function takes the configuration as an argument: its numbers are traced, so seeds and hyperparameters vary
+together under one `jax.vmap` of `init` and `epoch`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from annotated_types import Ge, Gt, Le
+from flax import struct
+
+from arm5dof.ddpg import losses
+from arm5dof.ddpg.networks import Actor, Critic
+from arm5dof.ddpg.replay import Replay, Transition
+from arm5dof.envs.base import Env, GoalEnv, Observation, State
+from arm5dof.envs.vector import VectorEnv
+from arm5dof.errors import UserError
+from arm5dof.settings import settings, static
+
+Params = Any
+Metrics = dict[str, jax.Array]
+Unit = Annotated[float, Ge(0), Le(1)]
+Positive = Annotated[float, Gt(0)]
+Count = Annotated[int, Ge(1)]
+
+
+@settings
+class DDPGConfig:
+    """The agent."""
+
+    actor_lr: Positive = 3e-3
+    """Adam's step size for the actor at the start of training."""
+    critic_lr: Positive = 3e-3
+    """Adam's step size for the critic at the start of training."""
+    final_lr: Unit = 0.0
+    """Share of both step sizes that is left at the end; they follow a cosine."""
+    discount: Unit = 0.0
+    """gamma in Eq. 4. With absolute joint targets an answer is judged at once, so 0 is enough."""
+    tau: Unit = 0.01
+    """How far the target networks follow at each update."""
+    noise: Annotated[float, Ge(0)] = 0.5
+    """Standard deviation of the normal exploration noise at the start, in units of half a joint's range."""
+    final_noise: Annotated[float, Ge(0)] = 0.05
+    """The same at the end of training; it falls linearly."""
+    relabel: Unit = 0.8
+    """Share of sampled transitions whose goal is exchanged in hindsight for a point reached in another one."""
+    temperature: Positive = 0.01
+    """How sharply heads divide the targets among them, in units of reward (metres)."""
+    heads: Count = static(default=4)
+    """Candidate answers of the actor, among which the critic chooses. 1 is plain DDPG."""
+    critic_view: Literal["outcome", "state"] = static(default="outcome")
+    """outcome: the critic sees where the action leads by the arm's forward model, as the paper's does; state: it
+    sees the observation and the action."""
+    batch_size: Count = static(default=256)
+    """Transitions in an update."""
+    updates_per_step: Count = static(default=16)
+    """Updates after each step of all environments."""
+    width: Count = static(default=128)
+    """Units in a hidden layer."""
+    depth: Count = static(default=3)
+    """Hidden layers."""
+    activation: Literal["relu", "gelu", "tanh"] = static(default="gelu")
+    """Of the hidden layers."""
+    layer_norm: bool = static(default=True)
+    """Whether hidden layers are normalised."""
+    replay_capacity: Count = static(default=65_536)
+    """Transitions kept; rounded up to a multiple of the number of environments."""
+
+
+class Networks(struct.PyTreeNode):
+    """Parameters of the four networks."""
+
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+
+
+class Training(struct.PyTreeNode):
+    """Everything a run is made of: restored, it goes on as if nothing had happened."""
+
+    networks: Networks
+    actor_optimiser: optax.OptState
+    critic_optimiser: optax.OptState
+    replay: Replay
+    env: State
+    key: jax.Array
+    steps: jax.Array
+    """Steps taken by every environment, int32."""
+    updates: jax.Array
+    """Updates made, int32."""
+
+
+class DDPG:
+    """The agent for one environment and one program shape (the static part of the configuration).
+
+    `total_steps` is the number of steps that each environment takes in the whole run: noise and step sizes fall over
+    it. Raises `UserError` if the configuration asks for what the environment cannot do.
+    """
+
+    def __init__(self, env: Env, config: DDPGConfig, num_envs: int, episode_length: int, total_steps: int) -> None:
+        self.goal_env: GoalEnv | None = env if isinstance(env, GoalEnv) else None
+        if config.critic_view == "outcome" and self.goal_env is None:
+            raise UserError("this environment foresees no outcome of an action: train with --critic-view state")
+        self.vector = VectorEnv(env, episode_length)
+        self.num_envs = num_envs
+        self.total_steps = total_steps
+        shape = {k: getattr(config, k) for k in ("width", "depth", "activation", "layer_norm")}
+        self.actor = Actor(action_size=env.action_size, heads=config.heads, **shape)
+        self.critic = Critic(**shape)
+        self.adam = optax.scale_by_adam()
+
+    def init(self, config: DDPGConfig, key: jax.Array) -> Training:
+        """Random networks, target networks equal to them, an empty replay buffer, environments at their start."""
+        key, actor_key, critic_key, env_key = jax.random.split(key, 4)
+        env = self.vector.reset(jax.random.split(env_key, self.num_envs))
+        obs = jax.tree.map(lambda x: x[0], env.obs)
+        action = jnp.zeros(self.vector.env.action_size)
+        actor = self.actor.init(actor_key, obs["state"])
+        critic = self.critic.init(critic_key, self.view(config, obs, action))
+        zero = jnp.zeros(())
+        example = Transition(obs, action, zero, obs, zero, zero)
+        capacity = -(-config.replay_capacity // self.num_envs) * self.num_envs
+        count = jnp.zeros((), jnp.int32)
+        return Training(
+            networks=Networks(actor, critic, actor, critic),
+            actor_optimiser=self.adam.init(actor),
+            critic_optimiser=self.adam.init(critic),
+            replay=Replay.create(example, capacity),
+            env=env,
+            key=key,
+            steps=count,
+            updates=count,
+        )
+
+    def view(self, config: DDPGConfig, obs: Observation, action: jax.Array) -> jax.Array:
+        """What the critic sees of one observation and one action."""
+        if config.critic_view == "outcome" and self.goal_env is not None:
+            return self.goal_env.outcome(obs, action)
+        return jnp.concatenate([obs["privileged_state"], action])
+
+    def candidates(self, actor: Params, obs: Observation) -> jax.Array:
+        """The actor's candidate actions for a batch of observations, (batch, heads, action_size)."""
+        return jnp.asarray(self.actor.apply(actor, obs["state"]))
+
+    def value(self, config: DDPGConfig, critic: Params, obs: Observation, actions: jax.Array) -> jax.Array:
+        """Q for a batch of observations and their candidate actions: (batch, heads, action_size) to (batch, heads)."""
+        each_head = jax.vmap(self.view, in_axes=(None, None, 0))
+        views = jax.vmap(each_head, in_axes=(None, 0, 0))(config, obs, actions)
+        return jnp.asarray(self.critic.apply(critic, views))
+
+    def act(self, config: DDPGConfig, actor: Params, critic: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
+        """The policy: the candidate that the critic prefers, and its value; (batch, action_size) and (batch,)."""
+        actions = self.candidates(actor, obs)
+        q = self.value(config, critic, obs, actions)
+        best = q.argmax(-1)
+        return _pick(actions, best), _pick(q, best)
+
+    def epoch(self, config: DDPGConfig, training: Training, steps: int) -> tuple[Training, Metrics]:
+        """Lines 6 to 15 of Algorithm 1, `steps` times: act, store, learn. Returns the metrics' means."""
+
+        def step(training: Training, _: None) -> tuple[Training, Metrics]:
+            training, collected = self.collect(config, training)
+            ready = training.replay.size >= config.batch_size
+            nothing = dict.fromkeys(("critic_loss", "q"), jnp.zeros(()))
+            training, learnt = jax.lax.cond(ready, lambda t: self.learn(config, t), lambda t: (t, nothing), training)
+            return training, {**collected, **learnt}
+
+        training, metrics = jax.lax.scan(step, training, None, steps)
+        nonfinite = metrics.pop("nonfinite").sum()
+        return training, {**jax.tree.map(jnp.mean, metrics), "nonfinite": nonfinite}
+
+    def collect(self, config: DDPGConfig, training: Training) -> tuple[Training, Metrics]:
+        """Lines 7 to 9: every environment acts with noise, and the replay buffer stores what came of it."""
+        key, noise_key = jax.random.split(training.key)
+        networks, obs = training.networks, training.env.obs
+        noise = config.noise + (config.final_noise - config.noise) * self._progress(training)
+        action, _ = self.act(config, networks.actor, networks.critic, obs)
+        action = jnp.clip(action + noise * jax.random.normal(noise_key, action.shape), -1, 1)
+        env = self.vector.step(training.env, action)
+        transition = Transition(
+            obs=obs,
+            action=action,
+            reward=env.reward,
+            next_obs=env.info["next_obs"],
+            terminal=env.done * (1 - env.info["truncation"]),
+            weight=1 - env.info["nonfinite"],
+        )
+        metrics = {
+            **{name: value.mean() for name, value in env.metrics.items()},
+            "reward": env.reward.mean(),
+            "noise": noise,
+            "nonfinite": env.info["nonfinite"].sum(),
+        }
+        replay = training.replay.insert(transition)
+        return training.replace(replay=replay, env=env, key=key, steps=training.steps + 1), metrics
+
+    def learn(self, config: DDPGConfig, training: Training) -> tuple[Training, Metrics]:
+        """Lines 10 to 15, `updates_per_step` times."""
+        key, sample_key, relabel_key = jax.random.split(training.key, 3)
+        shape = (config.updates_per_step, config.batch_size)
+        batches = self.relabel(config, training.replay, training.replay.sample(sample_key, shape), relabel_key)
+        training, metrics = jax.lax.scan(lambda t, batch: self.update(config, t, batch), training, batches)
+        return training.replace(key=key), jax.tree.map(jnp.mean, metrics)
+
+    def relabel(self, config: DDPGConfig, replay: Replay, batch: Transition, key: jax.Array) -> Transition:
+        """Hindsight: exchange the goals of a share of transitions (any leading axes) for points reached elsewhere in
+        the buffer. The reward for any goal is known, so this is exact."""
+        env = self.goal_env
+        if env is None:
+            return batch
+        shape = batch.reward.shape
+        choice_key, goal_key = jax.random.split(key)
+        chosen = jax.random.uniform(choice_key, shape) < config.relabel
+        donors = replay.sample(goal_key, shape).next_obs
+
+        def one(transition: Transition, donor: Observation, chosen: jax.Array) -> Transition:
+            goal = env.achieved(donor)
+            changed = transition.replace(
+                obs=env.relabel(transition.obs, goal),
+                next_obs=env.relabel(transition.next_obs, goal),
+                reward=env.goal_reward(env.achieved(transition.next_obs), goal),
+            )
+            return jax.tree.map(lambda new, old: jnp.where(chosen, new, old), changed, transition)
+
+        for _ in shape:
+            one = jax.vmap(one)
+        return one(batch, donors, chosen)
+
+    def update(self, config: DDPGConfig, training: Training, batch: Transition) -> tuple[Training, Metrics]:
+        """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau."""
+        networks = training.networks
+        target = batch.reward + jax.lax.cond(
+            config.discount > 0, lambda: self._bootstrap(config, networks, batch), lambda: jnp.zeros_like(batch.reward)
+        )
+
+        def critic_loss(critic: Params) -> tuple[jax.Array, jax.Array]:
+            q = self.value(config, critic, batch.obs, batch.action[:, None])[:, 0]
+            return losses.critic_loss(q, target, batch.weight), q.mean()
+
+        def actor_loss(actor: Params) -> jax.Array:
+            q = self.value(config, critic, batch.obs, self.candidates(actor, batch.obs))
+            return losses.actor_loss(q, batch.weight, config.temperature)
+
+        rate = config.final_lr + (1 - config.final_lr) * (1 + jnp.cos(jnp.pi * self._progress(training))) / 2
+        (loss, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(networks.critic)
+        critic, critic_optimiser = self._descend(
+            networks.critic, gradient, training.critic_optimiser, rate * config.critic_lr
+        )
+        actor, actor_optimiser = self._descend(
+            networks.actor, jax.grad(actor_loss)(networks.actor), training.actor_optimiser, rate * config.actor_lr
+        )
+        networks = Networks(
+            actor=actor,
+            critic=critic,
+            target_actor=optax.incremental_update(actor, networks.target_actor, config.tau),
+            target_critic=optax.incremental_update(critic, networks.target_critic, config.tau),
+        )
+        training = training.replace(
+            networks=networks,
+            actor_optimiser=actor_optimiser,
+            critic_optimiser=critic_optimiser,
+            updates=training.updates + 1,
+        )
+        return training, {"critic_loss": loss, "q": q}
+
+    def _bootstrap(self, config: DDPGConfig, networks: Networks, batch: Transition) -> jax.Array:
+        """gamma Q'(s', mu'(s')), nothing beyond a terminal state."""
+        _, q = self.act(config, networks.target_actor, networks.target_critic, batch.next_obs)
+        return config.discount * (1 - batch.terminal) * q
+
+    def _descend(
+        self, params: Params, gradient: Params, state: optax.OptState, rate: jax.Array
+    ) -> tuple[Params, optax.OptState]:
+        direction, state = self.adam.update(gradient, state)
+        return jax.tree.map(lambda p, d: p - rate * d, params, direction), state
+
+    def _progress(self, training: Training) -> jax.Array:
+        return jnp.minimum(training.steps / self.total_steps, 1.0)
+
+
+def _pick(values: jax.Array, index: jax.Array) -> jax.Array:
+    """values[i, index[i]] for each i."""
+    return jax.vmap(lambda v, i: v[i])(values, index)

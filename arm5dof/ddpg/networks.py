@@ -1,0 +1,65 @@
+"""Actor and critic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh}
+
+
+class MLP(nn.Module):
+    """Hidden layers of equal width, optionally layer-normalised, and a linear last layer; (..., in) to (..., out)."""
+
+    width: int
+    depth: int
+    out: int
+    activation: str
+    layer_norm: bool
+    bias_init: Callable[..., jax.Array] = nn.initializers.zeros_init()
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for _ in range(self.depth):
+            x = nn.Dense(self.width)(x)
+            if self.layer_norm:
+                x = nn.LayerNorm()(x)
+            x = ACTIVATIONS[self.activation](x)
+        return nn.Dense(self.out, kernel_init=nn.initializers.orthogonal(0.1), bias_init=self.bias_init)(x)
+
+
+class Actor(nn.Module):
+    """mu(s): observations (..., state) to `heads` candidate actions (..., heads, action_size) in [-1, 1].
+
+    A single continuous map from targets to joint angles must tear somewhere: several heads can cover it in pieces.
+    They start from different random constants.
+    """
+
+    action_size: int
+    heads: int
+    width: int
+    depth: int
+    activation: str
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        spread = nn.initializers.normal(0.5) if self.heads > 1 else nn.initializers.zeros_init()
+        x = MLP(self.width, self.depth, self.heads * self.action_size, self.activation, self.layer_norm, spread)(obs)
+        return jnp.tanh(x).reshape(*obs.shape[:-1], self.heads, self.action_size)
+
+
+class Critic(nn.Module):
+    """Q(s, a): the critic's view of an observation and an action, (..., view), to values (...)."""
+
+    width: int
+    depth: int
+    activation: str
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, view: jax.Array) -> jax.Array:
+        return MLP(self.width, self.depth, 1, self.activation, self.layer_norm)(view)[..., 0]

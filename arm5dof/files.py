@@ -1,0 +1,52 @@
+"""Files: the ones shipped with the package, and writing that never leaves half of one."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parent
+
+
+def find(folder: str, name: str | Path) -> Path | None:
+    """A file the user named, or one of that name in a shipped folder (`mjcf`, `experiments`); None if neither is.
+
+    An installed wheel carries those folders inside the package, a checkout beside it.
+    """
+    candidates = [Path(name), PACKAGE / folder / name, PACKAGE.parent / folder / name]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def shipped(folder: str, suffix: str) -> list[str]:
+    """Names of the files that ship in a folder, for error messages and help."""
+    roots = (PACKAGE / folder, PACKAGE.parent / folder)
+    return sorted({path.name for root in roots if root.is_dir() for path in root.glob(f"*{suffix}")})
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path` that takes its place when the block succeeds and vanishes when it fails."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,76 @@
+"""A trained policy as an inverse-kinematics solver: targets in, joint angles out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from arm5dof.arm import Arm
+from arm5dof.ddpg import DDPG, DDPGConfig, Networks
+from arm5dof.envs import Reach
+
+
+class Answer(NamedTuple):
+    """Joint positions (n, dof) in radians, the end effector they lead to (n, 3) and its distance from the target (n,)
+    in metres, both by forward kinematics."""
+
+    q: jax.Array
+    position: jax.Array
+    error: jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained policy for one arm."""
+
+    env: Reach
+    agent: DDPG
+    config: DDPGConfig
+    networks: Networks
+
+    @property
+    def arm(self) -> Arm:
+        return self.env.arm
+
+    def __call__(self, targets: jax.Array, refine: int = 0) -> Answer:
+        """Answer `targets` (n, 3), metres in the world frame, asked from the arm's home pose.
+
+        With `refine` > 0 the policy is asked again as often, with the target shifted by the error it was seen to
+        make; the best answer counts. No Jacobian is involved. The head that the critic chose first is kept.
+        """
+        return self._answer(self.networks, jnp.asarray(targets, jnp.float32), refine)
+
+    @cached_property
+    def _answer(self):  # type: ignore[no-untyped-def]
+        return jax.jit(self.answer, static_argnums=2)
+
+    def answer(self, networks: Networks, targets: jax.Array, refine: int) -> Answer:
+        """The pure function behind a call."""
+        seen = self.env.start(jnp.asarray(self.arm.home, jnp.float32), targets[0]).obs
+        observe = jax.vmap(partial(self.env.relabel, seen))
+
+        actions = self.agent.candidates(networks.actor, observe(targets))
+        head = self.agent.value(self.config, networks.critic, observe(targets), actions).argmax(-1)
+
+        def ask(points: jax.Array) -> Answer:
+            actions = self.agent.candidates(networks.actor, observe(points))
+            q = self.arm.to_joints(jnp.take_along_axis(actions, head[:, None, None], 1)[:, 0])
+            position = self.arm.forward(q)
+            return Answer(q, position, jnp.linalg.norm(position - targets, axis=-1))
+
+        best = latest = ask(targets)
+        asked = targets
+        for _ in range(refine):
+            asked = asked + targets - latest.position
+            latest = ask(asked)
+            better = latest.error < best.error
+            best = Answer(*(jnp.where(_like(better, a), a, b) for a, b in zip(latest, best, strict=True)))
+        return best
+
+
+def _like(mask: jax.Array, array: jax.Array) -> jax.Array:
+    return mask.reshape(mask.shape + (1,) * (array.ndim - mask.ndim))

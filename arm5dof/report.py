@@ -1,0 +1,141 @@
+"""What a run shows people: the paper's Figures 7 and 8, its Table 2, and a report that holds them together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from arm5dof import files
+from arm5dof.evaluate import table
+
+if TYPE_CHECKING:
+    from arm5dof.config import Config
+
+PAPER_TABLE_2 = {
+    "Min": {100: 3.0, 200: 24.0, 300: 63.0, 400: 93.0},
+    "Max": {100: 22.0, 200: 61.0, 300: 89.0, 400: 98.0},
+    "Mean": {100: 12.5, 200: 42.33, 300: 76.0, 400: 95.5},
+}
+"""The paper's Table 2: IK solver accuracy in percent after 100 to 400 episodes. It names no tolerance."""
+
+INK, BLUE, ORANGE = "#22252b", "#2a6fb0", "#e8722c"
+STYLE: dict[str, Any] = {
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "savefig.dpi": 150,
+}
+
+
+def headline(config: Config) -> str:
+    """The accuracy a run is judged by: the episode where the servos move the arm, one answer where they do not."""
+    return "episode" if config.env.dynamics == "servo" else "one_shot"
+
+
+def write(folder: Path, config: Config, rows: list[dict[str, Any]], evaluations: list[dict[str, Any]]) -> None:
+    """Write the figures and `report.md` into a run's folder."""
+    episodes = np.array([float(row["env_steps"]) for row in rows]) / config.env.episode_length
+    reward = np.array([float(row["reward"]) for row in rows])
+    distance = np.array([float(row["distance"]) for row in rows])
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        save(figure_7(episodes, reward), folder / "figure_7_reward.png")
+        save(figure_8(episodes, distance, evaluations, headline(config)), folder / "figure_8_error.png")
+    files.write_text(folder / "report.md", markdown(folder.name, config, rows, evaluations))
+
+
+def figure_7(episodes: np.ndarray, reward: np.ndarray) -> Figure:
+    """The paper's Figure 7: reward against episodes, normalised to [0, 1] between the worst and zero distance."""
+    figure, axes = _axes("normalised reward")
+    axes.plot(episodes, 1 - reward / reward.min(), color=BLUE, lw=1.8)
+    axes.set_ylim(0, 1.02)
+    axes.set_title("Reward while exploring (Figure 7)", loc="left", color=INK)
+    return figure
+
+
+def figure_8(episodes: np.ndarray, distance: np.ndarray, evaluations: list[dict[str, Any]], name: str) -> Figure:
+    """The paper's Figure 8: distance between end effector and object against episodes, normalised by its first
+    value; and the greedy policy's median error on unseen targets, in millimetres."""
+    figure, axes = _axes("normalised error while exploring")
+    axes.plot(episodes, distance / distance[0], color=BLUE, lw=1.8)
+    axes.set_ylim(0, 1.05)
+    axes.yaxis.label.set_color(BLUE)
+    axes.set_title("Distance between end effector and object (Figure 8)", loc="left", color=INK)
+    right = axes.twinx()
+    right.grid(False)
+    right.spines["right"].set_visible(True)
+    right.plot([e["episodes"] for e in evaluations], [e[name]["median_mm"] for e in evaluations], "o-", color=ORANGE)
+    right.set_ylabel(f"median error of the policy, mm ({name})", color=ORANGE)
+    right.set_ylim(bottom=0)
+    return figure
+
+
+def table_2(config: Config, evaluations: list[dict[str, Any]]) -> str:
+    """The paper's Table 2 and, below it, this run's share within 10 mm and its normalised accuracy."""
+    name, columns = headline(config), [e["episodes"] for e in evaluations]
+    lines = [
+        "| accuracy | " + " | ".join(f"{episodes} episodes" for episodes in columns) + " |",
+        "| --- |" + " ---: |" * len(columns),
+    ]
+    for row, cells in PAPER_TABLE_2.items():
+        lines.append(f"| paper, {row} | " + " | ".join(f"{cells[e]:g} %" if e in cells else "" for e in columns) + " |")
+    ours = {
+        f"**this run, within 10 mm ({name})**": [e[name]["within"]["10"] for e in evaluations],
+        "this run, normalised": [e["normalised"] for e in evaluations],
+    }
+    lines += [f"| {row} | " + " | ".join(f"{value:.2f} %" for value in cells) + " |" for row, cells in ours.items()]
+    return "\n".join(lines)
+
+
+def markdown(title: str, config: Config, rows: list[dict[str, Any]], evaluations: list[dict[str, Any]]) -> str:
+    """`report.md`."""
+    last, final = rows[-1], evaluations[-1]
+    resets = sum(float(row["nonfinite"]) for row in rows)
+    return f"""# {title}
+
+{last["episodes"]} episodes of {config.env.episode_length} steps ({last["env_steps"]} transitions),
+{last["updates"]} updates, {config.env.dynamics} dynamics, seed {config.train.seed};
+{float(last["seconds"]):.0f} s with compilation and evaluations on the way.
+Environments reset for non-finite physics: {resets:.0f}.
+
+## Accuracy on {final["targets"]} unseen targets
+
+{table({name: final[name] for name in ("one_shot", "refined", "episode")})}
+
+`one_shot`: one answer, by forward kinematics.
+`refined`: asked again {config.evaluate.refinements} times with the target shifted by the error seen.
+`episode`: the last step of an episode from a random pose.
+
+## Table 2
+
+{table_2(config, evaluations)}
+
+The paper states no tolerance for its accuracy. "Normalised" is the share of the initial distance that is gone at the
+end of an episode, on average.
+
+![normalised reward](figure_7_reward.png)
+
+![normalised error](figure_8_error.png)
+"""
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, atomically."""
+    with files.replacing(path) as temporary:
+        FigureCanvasAgg(figure).print_figure(str(temporary))
+
+
+def _axes(label: str) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_xlabel("episodes")
+    axes.set_ylabel(label)
+    return figure, axes

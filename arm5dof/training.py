@@ -1,0 +1,116 @@
+"""The host's side of training: epochs on the device, and between them metrics, evaluations and checkpoints."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from annotated_types import Ge
+
+from arm5dof.ddpg import DDPG, DDPGConfig, Training
+from arm5dof.envs import Reach
+from arm5dof.errors import UserError
+from arm5dof.policy import Policy
+from arm5dof.settings import settings, static
+
+Count = Annotated[int, Ge(1)]
+
+
+@settings
+class TrainConfig:
+    """The budget."""
+
+    seed: Annotated[int, Ge(0)] = static(default=0)
+    """Of all random numbers: same seed and machine, same bits."""
+    episodes: Count = static(default=400)
+    """Episodes in all; a multiple of the number of environments."""
+    num_envs: Count = static(default=50)
+    """Environments that run side by side."""
+    epoch_steps: Count = static(default=16)
+    """Steps of every environment in one device call; divides the episode's length. Metrics have this grain."""
+    evaluate_every: Count = static(default=100)
+    """Episodes between evaluations; a multiple of the number of environments."""
+    checkpoint_every: Count = static(default=50)
+    """Episodes between checkpoints; a multiple of the number of environments."""
+
+
+class Settings(Protocol):
+    """The parts of a configuration that a training needs."""
+
+    @property
+    def ddpg(self) -> DDPGConfig: ...
+
+    @property
+    def train(self) -> TrainConfig: ...
+
+
+class Trainer:
+    """A compiled training program for one environment and configuration.
+
+    `state` is the whole run, made by `start` or restored from a checkpoint; `advance` takes it one epoch further.
+    Raises `UserError` if the budget does not divide.
+    """
+
+    state: Training
+
+    def __init__(self, env: Reach, config: Settings) -> None:
+        budget, length = config.train, env.config.episode_length
+        for name in ("episodes", "evaluate_every", "checkpoint_every"):
+            if getattr(budget, name) % budget.num_envs:
+                raise UserError(
+                    f"{name} = {getattr(budget, name)} is no multiple of num_envs = {budget.num_envs}: environments "
+                    f"finish their episodes together"
+                )
+        if length % budget.epoch_steps:
+            raise UserError(f"epoch_steps = {budget.epoch_steps} does not divide episode_length = {length}")
+        self.env = env
+        self.config = config
+        self.total_steps = budget.episodes // budget.num_envs * length
+        self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
+        self._init = jax.jit(self.agent.init)
+        self._epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1)
+
+    @property
+    def like(self) -> Training:
+        """Shapes and types of the state."""
+        return jax.eval_shape(self.agent.init, self.config.ddpg, jax.random.key(0))
+
+    def start(self) -> None:
+        """Begin a new run."""
+        self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+
+    def advance(self) -> dict[str, float]:
+        """One epoch. Returns its metrics: means over the epoch, and how many steps led to non-finite physics."""
+        self.state, metrics = self._epoch(self.config.ddpg, self.state, self.config.train.epoch_steps)
+        return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+    @property
+    def counters(self) -> Counters:
+        """How far the run is."""
+        steps = int(self.state.steps)
+        env_steps = steps * self.config.train.num_envs
+        return Counters(steps, env_steps // self.env.config.episode_length, env_steps, int(self.state.updates))
+
+    @property
+    def finished(self) -> bool:
+        return self.counters.steps >= self.total_steps
+
+    def policy(self) -> Policy:
+        """The policy as it is now. Its networks are copies: the next epoch reuses the originals' memory."""
+        networks = jax.tree.map(jnp.copy, self.state.networks)
+        return Policy(self.env, self.agent, self.config.ddpg, networks)
+
+
+class Counters(NamedTuple):
+    """Steps of each environment, episodes, steps of all environments together, and updates."""
+
+    steps: int
+    episodes: int
+    env_steps: int
+    updates: int
+
+
+def row(counters: Counters, seconds: float, metrics: dict[str, Any]) -> dict[str, Any]:
+    """One line of `metrics.csv`."""
+    return {**counters._asdict(), "seconds": round(seconds, 2), **metrics}
