@@ -54,7 +54,10 @@ SMOKE = {
 
 
 class Parser(argparse.ArgumentParser):
-    """One clear line for a bad command line, as for all other bad input."""
+    """One clear line for a bad command line, as for all other bad input, and no guessing at shortened options."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{**kwargs, "allow_abbrev": False})
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{message} (see {self.prog} --help)")
@@ -85,19 +88,19 @@ def train(known: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof train`."""
     from arm5dof import config, run
 
-    overrides = _overrides(rest)
+    experiment, overrides = _experiment_and_overrides(rest)
     if known.resume is not None:
-        others = [name for name, value in (("EXPERIMENT", known.experiment), ("--out", known.out)) if value]
+        others = [name for name, value in (("EXPERIMENT", experiment), ("--out", known.out)) if value]
         others += [f"--{name}" for name in overrides] + ["--smoke"] * known.smoke
         if others:
             raise UserError(f"--resume goes on with a run as it was configured; leave out {', '.join(others)}")
         current = run.Run.open(known.resume)
     else:
-        experiment = known.experiment or "reach.toml"
+        experiment = experiment or "reach.toml"
         given = {name.replace("-", "_").rsplit(".", 1)[-1] for name in overrides}
         smoke = {k: v for k, v in SMOKE.items() if k not in given} if known.smoke else {}
         settings = config.load(experiment, {**smoke, **overrides})
-        run.make_env(settings)  # What is wrong with the arm is said before a folder exists.
+        run.make_trainer(settings)  # What is wrong with the arm or the budget is said before a folder exists.
         out = known.out or run.free_folder(Path(experiment).stem + ("-smoke" if known.smoke else ""))
         current = run.Run.create(settings, out)
     print(f"run {current.folder} on {run.device()}", file=sys.stderr)
@@ -174,9 +177,12 @@ def _parser() -> Parser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
 
     raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("train", help="train a policy", description=TRAIN_HELP, formatter_class=raw, add_help=False)
+    # The experiment is not declared: next to settings that argparse does not know it would swallow their values.
+    usage = "arm5dof train [EXPERIMENT.toml] [--SETTING VALUE ...] [--out DIR] [--resume DIR] [--smoke]"
+    p = commands.add_parser(
+        "train", help="train a policy", usage=usage, description=TRAIN_HELP, formatter_class=raw, add_help=False
+    )
     p.add_argument("-h", "--help", action=_TrainHelp, nargs=0, help="show this help, every setting included")
-    p.add_argument("experiment", nargs="?", metavar="EXPERIMENT.toml", help="default: reach.toml")
     p.add_argument("--out", type=Path, metavar="DIR", help="the run's folder; default: runs/<experiment>")
     p.add_argument("--resume", type=Path, metavar="DIR", help="go on with the run in this folder")
     p.add_argument("--smoke", action="store_true", help="a short run with small batches")
@@ -219,23 +225,26 @@ class _TrainHelp(argparse.Action):
         parser.exit()
 
 
-def _overrides(rest: list[str]) -> dict[str, str]:
-    """`--field value` and `--field=value` pairs."""
-    found: dict[str, str] = {}
+def _experiment_and_overrides(rest: list[str]) -> tuple[str | None, dict[str, str]]:
+    """An experiment's name, and `--field value` or `--field=value` pairs, in any order."""
+    experiment, overrides = None, {}
     words = iter(rest)
     for word in words:
         if not word.startswith("--"):
-            raise UserError(f"unexpected argument {word!r} (see arm5dof train --help)")
+            if experiment is not None:
+                raise UserError(f"unexpected argument {word!r} (see arm5dof train --help)")
+            experiment = word
+            continue
         name, has_value, value = word[2:].partition("=")
         if not has_value:
             value = next(words, "")
             if not value or value.startswith("--"):
                 from arm5dof import config
 
-                config.load("reach.toml", {name: value})  # An unknown name is the likelier mistake.
+                config.find(name)  # If there is no such setting, that is what to say.
                 raise UserError(f"--{name} needs a value")
-        found[name] = value
-    return found
+        overrides[name] = value
+    return experiment, overrides
 
 
 def _nothing_left(rest: list[str]) -> None:

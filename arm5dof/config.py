@@ -81,17 +81,13 @@ def load(experiment: str | Path, overrides: Mapping[str, str] | None = None) -> 
         return build(values, str(path))
     build(values, str(path))  # So that a fault of the file is not blamed on the command line.
     for name, text in overrides.items():
-        known_field = _field(name)
+        known_field = find(name)
         values.setdefault(known_field.section, {})[known_field.name] = _parse(text, known_field.default)
     return build(values, "command line")
 
 
-def dumps(config: Config) -> str:
-    """The configuration as TOML, every field spelled out."""
-    return tomli_w.dumps(dataclasses.asdict(config))
-
-
-def _field(name: str) -> Field:
+def find(name: str) -> Field:
+    """The setting of that name. Raises `UserError` naming the nearest one if there is none."""
     wanted = name.replace("-", "_")
     known = {key: f for f in fields() for key in (f.name, f"{f.section}.{f.name}")}
     if wanted not in known:
@@ -99,6 +95,11 @@ def _field(name: str) -> Field:
         hint = f"did you mean --{near[0].replace('_', '-')}?" if near else "see arm5dof train --help"
         raise UserError(f"unknown option --{name}: {hint}")
     return known[wanted]
+
+
+def dumps(config: Config) -> str:
+    """The configuration as TOML, every field spelled out."""
+    return tomli_w.dumps(dataclasses.asdict(config))
 
 
 def _parse(text: str, default: Any) -> Any:

@@ -62,7 +62,7 @@ class Run:
 
     def policy(self) -> Policy:
         """The policy of the newest checkpoint."""
-        trainer = training.Trainer(make_env(self.config), self.config)
+        trainer = make_trainer(self.config)
         networks = self.checkpoints().restore_networks(trainer.like.networks)
         return Policy(trainer.env, trainer.agent, self.config.ddpg, networks)
 
@@ -83,9 +83,9 @@ class Run:
             yield
 
 
-def make_env(settings: Config) -> Reach:
-    """The environment that a configuration describes."""
-    return Reach(arm.load(settings.env.arm, settings.env.site), settings.env)
+def make_trainer(settings: Config) -> training.Trainer:
+    """The training program that a configuration describes. Raises `UserError` if there is something wrong with it."""
+    return training.Trainer(Reach(arm.load(settings.env.arm, settings.env.site), settings.env), settings)
 
 
 def train(run: Run) -> list[dict[str, Any]]:
@@ -96,7 +96,7 @@ def train(run: Run) -> list[dict[str, Any]]:
 
 def _train(run: Run) -> list[dict[str, Any]]:
     budget = run.config.train
-    trainer = training.Trainer(make_env(run.config), run.config)
+    trainer = make_trainer(run.config)
     checkpoints = Checkpoints(run.folder / "checkpoints")
     length = run.config.env.episode_length
     with Bar("training", budget.episodes, "episodes") as bar:

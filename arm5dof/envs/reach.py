@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from annotated_types import Ge
-from mujoco import mjx
 
 from arm5dof.arm import Arm
 from arm5dof.envs.base import Observation, State
 from arm5dof.errors import UserError
+from arm5dof.mjx import mjx
 from arm5dof.settings import settings, static
 
 

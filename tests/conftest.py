@@ -1,0 +1,43 @@
+"""What all tests share: the compilation cache, the arm, and two environments."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import settings
+
+from arm5dof import xla
+
+# JAX reads these settings when it is imported, so nothing above may import it, and the fixtures below import late.
+xla.enable_compilation_cache()
+
+if TYPE_CHECKING:
+    from arm5dof.arm import Arm
+    from arm5dof.envs import Reach
+
+settings.register_profile("arm5dof", deadline=None, derandomize=True, max_examples=25)
+settings.load_profile("arm5dof")
+
+
+@pytest.fixture(scope="session")
+def arm() -> Arm:
+    from arm5dof.arm import load
+
+    return load("reach.xml")
+
+
+@pytest.fixture(scope="session")
+def kinematic(arm: Arm) -> Reach:
+    """Reach where an action is the pose."""
+    from arm5dof.envs import Reach, ReachConfig
+
+    return Reach(arm, ReachConfig(dynamics="kinematic"))
+
+
+@pytest.fixture(scope="session")
+def servo(arm: Arm) -> Reach:
+    """Reach in MJX physics, with the observation that holds velocities too."""
+    from arm5dof.envs import Reach, ReachConfig
+
+    return Reach(arm, ReachConfig(dynamics="servo", observation="full"))

@@ -1,0 +1,328 @@
+"""The command line: what it does, and what it says of bad input: one line on stderr, exit status 2, nothing lost."""
+
+import csv
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from arm5dof import arm, cli
+
+TINY = [
+    "kinematic.toml",
+    "--episodes",
+    "4",
+    "--num-envs",
+    "2",
+    "--evaluate-every",
+    "2",
+    "--checkpoint-every",
+    "2",
+    "--episode-length",
+    "32",
+    "--batch-size",
+    "32",
+    "--width",
+    "16",
+    "--heads",
+    "2",
+    "--updates-per-step",
+    "2",
+    "--targets",
+    "200",
+    "--interim-targets",
+    "100",
+    "--replay-capacity",
+    "1024",
+]
+
+
+def run(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A finished run, too short to be any good."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    assert run("train", *TINY, "--out", folder) == 0
+    return folder
+
+
+@pytest.fixture
+def fails(capsys):
+    """Run a command that must fail; return its one line."""
+
+    def check(*arguments):
+        capsys.readouterr()
+        assert run(*arguments) == 2
+        err = capsys.readouterr().err
+        lines = [line for line in err.splitlines() if line.startswith("arm5dof: ")]
+        assert len(lines) == 1 and "Traceback" not in err and err.endswith(lines[0] + "\n")
+        return lines[0]
+
+    return check
+
+
+def digest(folder):
+    """Everything in a folder, to see that nothing was touched; the lock holds nothing."""
+    files = sorted(p for p in Path(folder).rglob("*") if p.is_file() and p.name != ".lock")
+    return [(str(p), hashlib.sha256(p.read_bytes()).hexdigest()) for p in files]
+
+
+def test_a_run_leaves_everything(trained):
+    names = {p.name for p in trained.iterdir()}
+    figures = {"figure_7_reward.png", "figure_8_error.png"}
+    assert {"config.toml", "metrics.csv", "evaluations.json", "checkpoints", "report.md"} | figures <= names
+    for figure in figures:
+        assert (trained / figure).read_bytes().startswith(b"\x89PNG")
+    rows = list(csv.DictReader(open(trained / "metrics.csv")))
+    assert [int(row["steps"]) for row in rows] == [16, 32, 48, 64]
+    assert int(rows[-1]["episodes"]) == 4 and int(rows[-1]["env_steps"]) == 128
+    report = (trained / "report.md").read_text()
+    assert "Table 2" in report and "| paper, Mean |" in report
+    assert [e["episodes"] for e in json.loads((trained / "evaluations.json").read_text())] == [2, 4]
+
+
+def test_eval_json_has_exactly_these_keys(trained, capsys):
+    capsys.readouterr()
+    assert run("eval", trained, "--targets", 300, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["one_shot", "refined", "episode"]
+    for accuracy in found.values():
+        assert list(accuracy) == ["median_mm", "p95_mm", "within"]
+        assert list(accuracy["within"]) == ["1", "5", "10", "20"]
+        shares = list(accuracy["within"].values())
+        assert shares == sorted(shares) and shares[0] >= 0 and shares[-1] <= 100
+        assert 0 < accuracy["median_mm"] <= accuracy["p95_mm"]
+
+
+def test_eval_repeats_itself_and_follows_its_seed(trained, capsys):
+    def evaluate(seed):
+        capsys.readouterr()
+        assert run("eval", trained, "--targets", 200, "--seed", seed, "--json") == 0
+        return capsys.readouterr().out
+
+    assert evaluate(1) == evaluate(1) != evaluate(2)
+
+
+def reached_by(row, names):
+    """Where C MuJoCo says that an answer's joint angles lead."""
+    model = mujoco.MjModel.from_xml_path(str(Path(__file__).parent.parent / "mjcf" / "reach.xml"))
+    data = mujoco.MjData(model)
+    for name in names:
+        data.joint(name).qpos = float(row[name])
+    mujoco.mj_kinematics(model, data)
+    return data.site("ee").xpos
+
+
+def test_solve_answers_and_tells_its_error(trained, capsys):
+    targets = [[0.15, 0.05, 0.12], [-0.1, 0.1, 0.2]]
+    words = [word for t in targets for word in ("--target", *t)]
+    capsys.readouterr()
+    assert run("solve", trained, *words, "--json", "--tolerance-mm", 1000) == 0
+    answers = json.loads(capsys.readouterr().out)
+    assert [a["target_m"] for a in answers] == targets
+    loaded = arm.load("reach.xml")
+    for answer in answers:
+        joints = answer["joints_rad"]
+        assert list(joints) == [f"theta_{i}" for i in range(1, 6)]
+        q = np.array(list(joints.values()))
+        assert (q >= loaded.lower - 1e-6).all() and (q <= loaded.upper + 1e-6).all()
+        miss = np.linalg.norm(reached_by(joints, joints) - answer["target_m"]) * 1e3
+        assert miss == pytest.approx(answer["error_mm"], abs=1e-3)
+
+
+def test_solve_takes_and_gives_csv(trained, tmp_path):
+    points, answers = tmp_path / "points.csv", tmp_path / "answers.csv"
+    points.write_text("name,x,y,z\na,0.15,0.05,0.12\nb,0.1,-0.1,0.2\n")
+    assert run("solve", trained, "--csv", points, "--out", answers, "--tolerance-mm", 1000) == 0
+    rows = list(csv.DictReader(open(answers)))
+    assert len(rows) == 2 and all(row["reached"] == "1" for row in rows)
+    for row in rows:
+        target = [float(row[axis]) for axis in "xyz"]
+        miss = np.linalg.norm(reached_by(row, [f"theta_{i}" for i in range(1, 6)]) - target) * 1e3
+        assert miss == pytest.approx(float(row["error_mm"]), abs=1e-3)
+
+
+def test_solve_refuses_bad_targets(trained, tmp_path, fails):
+    before = digest(trained)
+    assert "not finite" in fails("solve", trained, "--target", "nan", 0, 0)
+    assert "not finite" in fails("solve", trained, "--target", 0, "inf", 0)
+    said = fails("solve", trained, "--target", 1, 0, 0)
+    assert "1 of 1 targets not reached" in said and "reaches 0.268 m" in said
+    assert "either" in fails("solve", trained)
+    assert "expected 3 arguments" in fails("solve", trained, "--target", 1, 2)
+    for name, text, expected in [
+        ("empty.csv", "", "header"),
+        ("header.csv", "x,y,z\n", "no targets"),
+        ("columns.csv", "a,b\n1,2\n", "header"),
+        ("words.csv", "x,y,z\n0,0,there\n", "line 2"),
+        ("short.csv", "x,y,z\n0,0\n", "line 2"),
+        ("nan.csv", "x,y,z\n0.1,0.1,nan\n", "not finite"),
+    ]:
+        (tmp_path / name).write_text(text)
+        assert expected in fails("solve", trained, "--csv", tmp_path / name)
+    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00\x01")
+    assert "not a CSV" in fails("solve", trained, "--csv", tmp_path / "binary.csv")
+    assert "No such file" in fails("solve", trained, "--csv", tmp_path / "absent.csv")
+    (tmp_path / "good.csv").write_text("x,y,z\n0.15,0.05,0.12\n")
+    (tmp_path / "there.csv").write_text("precious")
+    assert "exists" in fails("solve", trained, "--csv", tmp_path / "good.csv", "--out", tmp_path / "there.csv")
+    assert (tmp_path / "there.csv").read_text() == "precious"
+    assert digest(trained) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--batch-sise", "3"], "did you mean --batch-size?"),
+        (["--batch-size", "many"], "valid integer"),
+        (["--batch-size"], "needs a value"),
+        (["--discount", "1.5"], "less than or equal to 1"),
+        (["nowhere.toml"], "no experiment 'nowhere.toml'"),
+        (["reach.toml", "again.toml"], "unexpected argument 'again.toml'"),
+        (["--arm", "nowhere.xml"], "no MJCF file 'nowhere.xml'"),
+        (["--site", "nose"], "no site 'nose'"),
+        (["--episodes", "30"], "no multiple of num_envs"),
+        (["--epoch-steps", "7"], "does not divide"),
+        (["--resume", "nowhere"], "no run"),
+        (["--resume", "nowhere", "--seed", "3"], "leave out --seed"),
+    ],
+)
+def test_train_refuses_bad_input(arguments, said, fails, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert said in fails("train", *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, text, said in [
+        ("broken.xml", "<mujoco><worldbody>", "cannot read"),
+        ("unknown.xml", "<mujoco><nonsense/></mujoco>", "cannot read"),
+        ("empty.xml", "<mujoco/>", "no site 'ee'"),
+        (
+            "unactuated.xml",
+            "<mujoco><worldbody><body>"
+            '<joint name="a" range="-1 1"/><geom size="1"/><site name="ee"/></body></worldbody></mujoco>',
+            "no position actuator",
+        ),
+    ]:
+        (tmp_path / name).write_text(text)
+        assert said in fails("train", "--arm", name)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_runs_never_overwrite_each_other(trained, fails, tmp_path, monkeypatch):
+    before = digest(trained)
+    assert "exists" in fails("train", *TINY, "--out", trained)
+    assert digest(trained) == before
+    monkeypatch.chdir(tmp_path)
+    assert run("train", *TINY) == 0 and run("train", *TINY) == 0
+    assert {p.name for p in (tmp_path / "runs").iterdir()} == {"kinematic", "kinematic-2"}
+
+
+def test_a_finished_run_resumes_to_the_same_end(trained):
+    before = digest(trained / "checkpoints")
+    assert run("train", "--resume", trained) == 0
+    assert digest(trained / "checkpoints") == before
+
+
+def copy(folder, target):
+    subprocess.run(["cp", "-r", str(folder), str(target)], check=True)
+    return target
+
+
+def newest(folder):
+    return max((folder / "checkpoints").iterdir(), key=lambda p: int(p.name))
+
+
+def test_damaged_checkpoints_are_recognised(trained, tmp_path, fails):
+    pieces = [p.relative_to(trained) for p in newest(trained).rglob("*") if p.is_file()]
+    largest = sorted(pieces, key=lambda p: -(trained / p).stat().st_size)[:4]
+    for i, piece in enumerate(largest):
+        for kind in ("truncated", "flipped"):
+            folder = copy(trained, tmp_path / f"{i}-{kind}")
+            content = bytearray((folder / piece).read_bytes())
+            if kind == "truncated":
+                content = content[: len(content) // 2]
+            else:
+                content[len(content) // 2] ^= 0xFF
+            (folder / piece).write_bytes(content)
+            before = digest(folder)
+            assert "damaged" in fails("train", "--resume", folder), piece
+            assert digest(folder) == before
+
+
+def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails):
+    folder = copy(trained, tmp_path / "other")
+    text = (folder / "config.toml").read_text()
+    (folder / "config.toml").write_text(text.replace("width = 16", "width = 24"))
+    assert "does not fit config.toml" in fails("eval", folder)
+    assert "does not fit config.toml" in fails("train", "--resume", folder)
+
+    folder = copy(trained, tmp_path / "foreign")
+    for item in newest(folder).iterdir():
+        subprocess.run(["rm", "-r", str(item)], check=True)
+    (newest(folder) / "model.pkl").write_bytes(b"cos\nsystem\n(S'touch owned'\ntR.")
+    assert "checkpoint" in fails("eval", folder)
+
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    assert "is no run" in fails("eval", folder)
+    (folder / "config.toml").write_text((trained / "config.toml").read_text())
+    assert "no checkpoint yet" in fails("eval", folder)
+
+
+def test_a_full_disk_loses_nothing(tmp_path):
+    """Past its file-size limit a process gets the errors of a full disk; the limit is set once a checkpoint exists."""
+    folder = tmp_path / "full"
+    code = """
+import resource, sys
+from arm5dof import cli
+from arm5dof.checkpoint import Checkpoints
+
+save = Checkpoints.save
+def limited(self, training):
+    if self.latest is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+    save(self, training)
+Checkpoints.save = limited
+sys.exit(cli.main(sys.argv[1:]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, "train", *TINY, "--out", str(folder)], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("arm5dof: ")]
+    assert len(lines) == 1 and "--resume" in lines[0] and "Traceback" not in done.stderr
+    assert run("train", "--resume", folder) == 0
+    assert json.loads((folder / "evaluations.json").read_text())[-1]["episodes"] == 4
+
+
+def test_help_lists_every_setting(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("train", "--help")
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    assert "--resume" in text and "--actor-lr" in text and "--substeps" in text
+    assert run() == 0 and "COMMAND" in capsys.readouterr().out
+
+
+def test_interrupt_is_no_traceback(tmp_path):
+    """Ctrl-C ends a run with a word on how to go on."""
+    command = [sys.executable, "-m", "arm5dof", "train", *TINY, "--episodes", "4000", "--out", str(tmp_path / "run")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
+    while not (tmp_path / "run" / "metrics.csv").exists():
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "--resume" in err and "Traceback" not in err

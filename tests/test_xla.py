@@ -1,0 +1,32 @@
+"""The XLA flag is set where it is known, and never over the user's own."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from arm5dof import xla
+
+
+@pytest.mark.parametrize("version", ["0.8.3", "0.9.2", "0.10.2", "0.10.2.dev20260101"])
+def test_known_versions_get_the_flag(version):
+    assert xla.flags("", version) == xla.FUSION_EMITTERS
+    assert xla.flags("--xla_dump_to=x", version) == f"--xla_dump_to=x {xla.FUSION_EMITTERS}"
+
+
+@pytest.mark.parametrize("version", ["0.4.30", "0.8.2", "0.10.3", "0.11.2", "1.0"])
+def test_unknown_versions_are_left_alone(version):
+    assert xla.flags("--xla_dump_to=x", version) == "--xla_dump_to=x"
+
+
+def test_the_users_own_setting_wins():
+    assert xla.flags("--xla_cpu_use_fusion_emitters=true", "0.10.2") == "--xla_cpu_use_fusion_emitters=true"
+
+
+@pytest.mark.parametrize("own", ["", "--xla_cpu_use_fusion_emitters=true"])
+def test_jax_starts_with_what_was_set(own):
+    code = "import arm5dof, os, jax; jax.devices(); print(os.environ.get('XLA_FLAGS', ''))"
+    environment = {**os.environ, "XLA_FLAGS": own}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert ("=true" in done.stdout) == bool(own)
