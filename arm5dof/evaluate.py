@@ -11,6 +11,7 @@ numbers that training never touches. Three questions are asked of the same targe
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 import jax
@@ -18,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from annotated_types import Ge
 
-from arm5dof.envs import State
+from arm5dof.ddpg import DDPG, DDPGConfig, Networks
+from arm5dof.envs import Reach, State
 from arm5dof.policy import Policy
 from arm5dof.settings import settings, static
 
@@ -55,9 +57,10 @@ def evaluate(
     key = jax.random.fold_in(jax.random.key(seed), 0xE7A1)
     chunk = min(CHUNK, targets)
     errors: dict[str, list[np.ndarray]] = {name: [] for name in ("one_shot", "refined", "episode", "start")}
-    measure = jax.jit(lambda networks, key: _measure(policy, networks, key, chunk, refinements))
     for done in range(0, targets, chunk):
-        found = measure(policy.networks, jax.random.fold_in(key, done))
+        found = _measure(
+            policy.env, policy.agent, policy.config, policy.networks, jax.random.fold_in(key, done), chunk, refinements
+        )
         for name, values in found.items():
             errors[name].append(np.asarray(values)[: targets - done])
         if progress:
@@ -87,8 +90,10 @@ def table(results: dict[str, Accuracy]) -> str:
     return "\n".join(lines)
 
 
-def _measure(policy: Policy, networks: Any, key: jax.Array, count: int, refinements: int) -> dict[str, jax.Array]:
-    env, agent, config = policy.env, policy.agent, policy.config
+@partial(jax.jit, static_argnames=("env", "agent", "count", "refinements"))
+def _measure(
+    env: Reach, agent: DDPG, config: DDPGConfig, networks: Networks, key: jax.Array, count: int, refinements: int
+) -> dict[str, jax.Array]:
     goal_key, pose_key = jax.random.split(key)
     goals = jax.vmap(env.sample_goal)(jax.random.split(goal_key, count))
     state = jax.vmap(env.start)(env.arm.sample(pose_key, (count,)), goals)
@@ -100,9 +105,10 @@ def _measure(policy: Policy, networks: Any, key: jax.Array, count: int, refineme
 
     final, _ = jax.lax.scan(step, state, None, env.config.episode_length)
     last = final.metrics["distance"]
+    policy = Policy(env, agent, config, networks)
     return {
-        "one_shot": policy.answer(networks, goals, 0).error,
-        "refined": policy.answer(networks, goals, refinements).error,
+        "one_shot": policy(goals).error,
+        "refined": policy(goals, refinements).error,
         "episode": jnp.where(jnp.isfinite(last), last, jnp.inf),
         "start": start,
     }

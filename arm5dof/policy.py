@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks
@@ -36,40 +37,39 @@ class Policy:
     def arm(self) -> Arm:
         return self.env.arm
 
-    def __call__(self, targets: jax.Array, refine: int = 0) -> Answer:
+    def __call__(self, targets: ArrayLike, refine: int = 0) -> Answer:
         """Answer `targets` (n, 3), metres in the world frame, asked from the arm's home pose.
 
         With `refine` > 0 the policy is asked again as often, with the target shifted by the error it was seen to
         make; the best answer counts. No Jacobian is involved. The head that the critic chose first is kept.
         """
-        return self._answer(self.networks, jnp.asarray(targets, jnp.float32), refine)
+        return _answer(self.env, self.agent, self.config, self.networks, jnp.asarray(targets, jnp.float32), refine)
 
-    @cached_property
-    def _answer(self):  # type: ignore[no-untyped-def]
-        return jax.jit(self.answer, static_argnums=2)
 
-    def answer(self, networks: Networks, targets: jax.Array, refine: int) -> Answer:
-        """The pure function behind a call."""
-        seen = self.env.start(jnp.asarray(self.arm.home, jnp.float32), targets[0]).obs
-        observe = jax.vmap(partial(self.env.relabel, seen))
+@partial(jax.jit, static_argnames=("env", "agent", "refine"))
+def _answer(env: Reach, agent: DDPG, config: DDPGConfig, networks: Networks, targets: jax.Array, refine: int) -> Answer:
+    """Compiled once for an environment and an agent, whatever the networks."""
+    seen = env.start(jnp.asarray(env.arm.home, jnp.float32), targets[0]).obs
+    observe = jax.vmap(partial(env.relabel, seen))
 
-        actions = self.agent.candidates(networks.actor, observe(targets))
-        head = self.agent.value(self.config, networks.critic, observe(targets), actions).argmax(-1)
+    def candidates(points: jax.Array) -> jax.Array:
+        return agent.candidates(networks.actor, observe(points))
 
-        def ask(points: jax.Array) -> Answer:
-            actions = self.agent.candidates(networks.actor, observe(points))
-            q = self.arm.to_joints(jnp.take_along_axis(actions, head[:, None, None], 1)[:, 0])
-            position = self.arm.forward(q)
-            return Answer(q, position, jnp.linalg.norm(position - targets, axis=-1))
+    head = agent.value(config, networks.critic, observe(targets), candidates(targets)).argmax(-1)
 
-        best = latest = ask(targets)
-        asked = targets
-        for _ in range(refine):
-            asked = asked + targets - latest.position
-            latest = ask(asked)
-            better = latest.error < best.error
-            best = Answer(*(jnp.where(_like(better, a), a, b) for a, b in zip(latest, best, strict=True)))
-        return best
+    def ask(points: jax.Array) -> Answer:
+        q = env.arm.to_joints(jnp.take_along_axis(candidates(points), head[:, None, None], 1)[:, 0])
+        position = env.arm.forward(q)
+        return Answer(q, position, jnp.linalg.norm(position - targets, axis=-1))
+
+    best = latest = ask(targets)
+    asked = targets
+    for _ in range(refine):
+        asked = asked + targets - latest.position
+        latest = ask(asked)
+        better = latest.error < best.error
+        best = Answer(*(jnp.where(_like(better, a), a, b) for a, b in zip(latest, best, strict=True)))
+    return best
 
 
 def _like(mask: jax.Array, array: jax.Array) -> jax.Array:

@@ -150,9 +150,9 @@ def test_inverse_round_trip_on_a_million_poses():
     assert all(valid)
     assert max(distance) < NANOMETRE
     assert max(tilt) < 1e-9
-    # Where the arm is stretched out or folded, acos turns the last bit of a position into 1e-8 of angle.
+    # Where the arm is stretched out or folded, acos magnifies the last bit of a position.
     recovered = np.concatenate(recovered)
-    assert recovered.max() < 1e-5
+    assert recovered.max() < 1e-8
     assert np.quantile(recovered, 0.999) < 1e-9
 
 
@@ -272,9 +272,8 @@ def test_full_reach_is_reachable_in_float32():
     for theta in (stretched, folded):
         position = forward(theta).position
         solutions = inverse(position)
-        assert solutions.valid.all(-1).mean() > 0.99
-        error = np.abs(forward(solutions.theta).position - position[:, None]).max(-1)
-        assert np.nanmax(error) < 2e-6
+        assert solutions.valid.all()
+        assert np.abs(forward(solutions.theta).position - position[:, None]).max() < 1e-6
 
 
 @given(st.integers(0, 2), st.sampled_from([np.nan, np.inf, -np.inf]))
@@ -304,16 +303,14 @@ def test_printed_azimuth_is_off_by_half_a_turn_in_half_the_cases():
     np.testing.assert_array_equal(right, np.sin(theta[:, 2:].sum(-1)) < 0)
 
 
-def test_printed_inverse_misses_for_want_of_d5():
-    """The same root with the printed offset d1 + d2 in place of d5 sends the arm elsewhere."""
-    theta = poses(20_000)
+def test_printed_root_has_the_wrong_offset():
+    """The paper prints d1 + d2 where the arm has d5: no angle comes out right, and a fifth is not even a number."""
+    theta = poses(100_000)
     (pose,) = in_chunks(forward, theta)
     x, y, _ = pose.position.T
+    offset = TABLE_1[0].d + TABLE_1[1].d
     with np.errstate(invalid="ignore"):
-        printed = [
-            np.arctan2(y, x) + np.arctan2(offset, sign * np.sqrt(x**2 + y**2 - offset**2))
-            for offset in (0.045 + 0.0,)
-            for sign in (1, -1)
-        ]
-    error = np.min(np.abs(wrapped(np.array(printed) - theta[:, 0] - theta[:, 1])), axis=0)
-    assert not (error < 1e-6).any()
+        root = np.sqrt(x**2 + y**2 - offset**2)
+    printed = np.arctan2(y, x) + np.arctan2(offset, np.stack([root, -root]))
+    assert 0.20 < np.isnan(printed).mean() < 0.22
+    assert not (np.abs(wrapped(printed - theta[:, 0] - theta[:, 1])) < 1e-6).any()

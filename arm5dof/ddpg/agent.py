@@ -66,7 +66,7 @@ class DDPGConfig:
     """Hidden layers."""
     activation: Literal["relu", "gelu", "tanh"] = static(default="gelu")
     """Of the hidden layers."""
-    layer_norm: bool = static(default=True)
+    layer_norm: bool = static(default=False)
     """Whether hidden layers are normalised."""
     replay_capacity: Count = static(default=65_536)
     """Transitions kept; rounded up to a multiple of the number of environments."""
