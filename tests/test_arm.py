@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from serial import serial_arm, seven_dof
 
+from arm5dof import files
 from arm5dof.arm import Arm, load
 from arm5dof.envs import ReachConfig
 from arm5dof.errors import UserError
@@ -76,8 +77,8 @@ def test_mjcf_is_table_1(arm: Arm):
     np.testing.assert_array_equal(model.jnt_pos[arm.joints], np.zeros((5, 3)))
     np.testing.assert_array_equal(model.qpos0[arm.qpos], np.zeros(5))
 
-    # MuJoCo's frames lead up to a joint, the table's away from it: row k's a and alpha go with row k + 1's d. The
-    # hinge of joint 5 sits d5 further along than its row says, which its own axis lets it.
+    # A body's frame stands before its hinge's turn, so row k's a and alpha share a transform with row k + 1's d, which
+    # commutes with the turn.
     lengths, twists = [0.0, *(link.a for link in TABLE_1)], [0.0, *(link.alpha for link in TABLE_1)]
     offsets = [*(link.d for link in TABLE_1), 0.0]
     positions = [*model.body_pos[bodies], model.site_pos[arm.site]]
@@ -150,7 +151,7 @@ def test_to_action_undoes_to_joints(dof: int, seed: int):
         np.testing.assert_allclose(arm.to_action(q), action, atol=1e-12)
         np.testing.assert_allclose(arm.to_joints(-jnp.ones(dof)), arm.lower, atol=1e-12)
         np.testing.assert_allclose(arm.to_joints(jnp.ones(dof)), arm.upper, atol=1e-12)
-    assert ((q >= arm.lower) & (q <= arm.upper)).all()
+        assert ((q >= arm.lower) & (q <= arm.upper)).all()
 
 
 def test_samples_fill_the_limits(arm: Arm):
@@ -244,9 +245,11 @@ def test_the_arm_does_not_sink_under_its_own_weight(arm: Arm):
 
 
 def test_fifty_grams_in_the_gripper_bend_it_by_less_than_a_tenth_of_a_millimetre():
-    spec = mujoco.MjSpec.from_file("mjcf/reach.xml")
+    spec = mujoco.MjSpec.from_file(str(files.find("mjcf", "reach.xml")))
     grasp = spec.site("grasp")
-    grasp.parent.add_body(name="load", pos=grasp.pos).add_geom(size=[0.005, 0, 0], mass=0.05, contype=0, conaffinity=0)
+    grasp.parent.add_body(name="load", pos=grasp.pos).add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], mass=0.05, contype=0, conaffinity=0
+    )
     arm = load(spec)
     data = mujoco.MjData(arm.mj_model)
     sunk = [steady(arm, data, q) for q in random_poses(arm, 200)]
