@@ -27,13 +27,20 @@ KEEP = 2
 
 
 class Checkpoints:
-    """The checkpoints of one run, in one folder, numbered by the steps taken."""
+    """The checkpoints of one run, in one folder, numbered by the steps taken.
 
-    def __init__(self, folder: Path) -> None:
+    Only the process that trains the run may open them for writing: it clears away what a killed one left unfinished.
+    """
+
+    def __init__(self, folder: Path, read_only: bool = False) -> None:
         self.folder = folder
         logging.getLogger("absl").setLevel(logging.ERROR)
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=KEEP, enable_async_checkpointing=False, cleanup_tmp_directories=True, create=True
+            max_to_keep=KEEP,
+            enable_async_checkpointing=False,
+            cleanup_tmp_directories=not read_only,
+            create=not read_only,
+            read_only=read_only,
         )
         with _as_user_error(f"cannot open the checkpoints in {folder}"):
             self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
@@ -115,7 +122,7 @@ def _rebuild(like: T, leaves: dict[str, Any]) -> T:
     def leaf(path: Any, template: Any) -> jax.Array:
         if not template.size:
             return jnp.zeros(template.shape, template.dtype)
-        value = jnp.asarray(leaves[jax.tree_util.keystr(path, simple=True, separator=".")])
+        value = jnp.array(leaves[jax.tree_util.keystr(path, simple=True, separator=".")])
         return jax.random.wrap_key_data(value) if _is_key(template) else value
 
     return jax.tree_util.tree_map_with_path(leaf, like)

@@ -70,7 +70,7 @@ class Run:
         folder = self.folder / "checkpoints"
         if not folder.is_dir():
             raise UserError(f"{self.folder} has no checkpoint yet: train it further with --resume {self.folder}")
-        return Checkpoints(folder)
+        return Checkpoints(folder, read_only=True)
 
     @contextmanager
     def locked(self) -> Iterator[None]:

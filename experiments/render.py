@@ -18,7 +18,7 @@ def main(path: Path) -> None:
     data.qpos[loaded.qpos] = POSE
     data.qpos[len(POSE) :] = 0.02
     mujoco.mj_kinematics(model, data)
-    data.mocap_pos[0] = data.site("grasp").xpos + [0.03, -0.02, -0.05]
+    data.mocap_pos[0] = data.site("grasp").xpos + np.array([0.03, -0.02, -0.05])
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, 600, 900) as renderer:
         renderer.update_scene(data, "front")

@@ -15,33 +15,11 @@ import pytest
 
 from arm5dof import arm, cli
 
-TINY = [
-    "kinematic.toml",
-    "--episodes",
-    "4",
-    "--num-envs",
-    "2",
-    "--evaluate-every",
-    "2",
-    "--checkpoint-every",
-    "2",
-    "--episode-length",
-    "32",
-    "--batch-size",
-    "32",
-    "--width",
-    "16",
-    "--heads",
-    "2",
-    "--updates-per-step",
-    "2",
-    "--targets",
-    "200",
-    "--interim-targets",
-    "100",
-    "--replay-capacity",
-    "1024",
-]
+TINY = (
+    "kinematic.toml --episodes 4 --num-envs 2 --evaluate-every 2 --checkpoint-every 2 --episode-length 32 "
+    "--batch-size 32 --width 16 --heads 2 --updates-per-step 2 --targets 100 --interim-targets 100 --replay- "
+    "capacity 1024"
+)
 
 
 def run(*arguments):
@@ -52,7 +30,7 @@ def run(*arguments):
 def trained(tmp_path_factory):
     """A finished run, too short to be any good."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
-    assert run("train", *TINY, "--out", folder) == 0
+    assert run("train", *TINY.split(), "--out", folder) == 0
     return folder
 
 
@@ -223,10 +201,10 @@ def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
 
 def test_runs_never_overwrite_each_other(trained, fails, tmp_path, monkeypatch):
     before = digest(trained)
-    assert "exists" in fails("train", *TINY, "--out", trained)
+    assert "exists" in fails("train", *TINY.split(), "--out", trained)
     assert digest(trained) == before
     monkeypatch.chdir(tmp_path)
-    assert run("train", *TINY) == 0 and run("train", *TINY) == 0
+    assert run("train", *TINY.split()) == 0 and run("train", *TINY.split()) == 0
     assert {p.name for p in (tmp_path / "runs").iterdir()} == {"kinematic", "kinematic-2"}
 
 
@@ -299,7 +277,10 @@ Checkpoints.save = limited
 sys.exit(cli.main(sys.argv[1:]))
 """
     done = subprocess.run(
-        [sys.executable, "-c", code, "train", *TINY, "--out", str(folder)], capture_output=True, text=True, cwd=tmp_path
+        [sys.executable, "-c", code, "train", *TINY.split(), "--out", str(folder)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
     )
     assert done.returncode == 2, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("arm5dof: ")]
@@ -319,7 +300,17 @@ def test_help_lists_every_setting(capsys):
 
 def test_interrupt_is_no_traceback(tmp_path):
     """Ctrl-C ends a run with a word on how to go on."""
-    command = [sys.executable, "-m", "arm5dof", "train", *TINY, "--episodes", "4000", "--out", str(tmp_path / "run")]
+    command = [
+        sys.executable,
+        "-m",
+        "arm5dof",
+        "train",
+        *TINY.split(),
+        "--episodes",
+        "4000",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
     while not (tmp_path / "run" / "metrics.csv").exists():
         assert process.poll() is None
