@@ -1,0 +1,669 @@
+"""The agent: replay buffer, losses, updates, exploration, hindsight, and whether it learns what it should."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from environments import Bandit, Loan, Salary, Toy, Walk
+from hypothesis import given
+from hypothesis import strategies as st
+from serial import seven_dof
+
+from arm5dof.arm import load
+from arm5dof.ddpg import DDPG, DDPGConfig, Replay, Training, Transition, losses
+from arm5dof.envs import Reach, ReachConfig
+from arm5dof.errors import UserError
+from arm5dof.policy import Policy
+
+SMALL = DDPGConfig(
+    heads=1,
+    critic_view="state",
+    batch_size=64,
+    updates_per_step=8,
+    width=32,
+    depth=2,
+    replay_capacity=4096,
+    noise=0.5,
+    final_noise=0.5,
+)
+
+
+def bits(tree: Any) -> Any:
+    """A pytree as numpy arrays, random keys as the numbers they are made of."""
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if is_key(x) else x), tree)
+
+
+def member(tree: Any, i: int) -> Any:
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def assert_same_bits(left: Any, right: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, bits(left), bits(right))
+
+
+def assert_finite(tree: Any) -> None:
+    for leaf in jax.tree.leaves(tree):
+        assert np.isfinite(leaf).all()
+
+
+# Replay
+
+
+def numbered(first: int, count: int) -> Transition:
+    """Transitions that carry their serial number in every field."""
+    n = jnp.arange(first, first + count, dtype=jnp.float32)
+    obs = {"state": jnp.stack([n, -n], -1), "privileged_state": n[:, None]}
+    return Transition(obs=obs, action=n[:, None], reward=n, next_obs=obs, terminal=n, weight=n)
+
+
+def filled(capacity: int, *batches: Transition) -> Replay:
+    replay = Replay.create(member(numbered(0, 1), 0), capacity)
+    for batch in batches:
+        replay = replay.insert(batch)
+    return replay
+
+
+@given(count=st.integers(1, 4), blocks=st.integers(1, 4), inserts=st.integers(0, 10))
+def test_replay_is_a_ring(count: int, blocks: int, inserts: int):
+    """Against a deque: the newest `capacity` transitions, the oldest overwritten first."""
+    capacity = count * blocks
+    model: deque[int] = deque(maxlen=capacity)
+    replay = filled(capacity)
+    assert replay.capacity == capacity
+    for i in range(inserts):
+        replay = replay.insert(numbered(1 + i * count, count))
+        model.extend(range(1 + i * count, 1 + (i + 1) * count))
+        assert replay.size == len(model)
+        held = np.asarray(replay.storage.reward)
+        oldest = int(replay.position) if len(model) == capacity else 0
+        assert np.roll(held, -oldest)[: len(model)].tolist() == list(model)
+    for leaf in jax.tree.leaves(replay.storage):
+        numbers = np.abs(np.asarray(leaf)).reshape(capacity, -1)
+        np.testing.assert_array_equal(
+            numbers, np.repeat(np.asarray(replay.storage.reward)[:, None], numbers.shape[1], 1)
+        )
+
+
+@given(inserts=st.integers(1, 7), seed=st.integers(0, 1000))
+def test_samples_are_what_was_inserted(inserts: int, seed: int):
+    replay = filled(12, *(numbered(1 + 3 * i, 3) for i in range(inserts)))
+    sample = replay.sample(jax.random.key(seed), (5, 8))
+    last = 3 * inserts
+    assert sample.reward.shape == (5, 8)
+    assert sample.obs["state"].shape == (5, 8, 2)
+    assert set(np.ravel(sample.reward)) <= set(range(max(1, last - 11), last + 1))
+    # All fields of one transition stay together.
+    np.testing.assert_array_equal(sample.obs["state"], jnp.stack([sample.reward, -sample.reward], -1))
+    np.testing.assert_array_equal(sample.next_obs["privileged_state"][..., 0], sample.reward)
+    np.testing.assert_array_equal(sample.action[..., 0], sample.weight)
+
+
+@pytest.mark.parametrize("inserts", [1, 3, 6])
+def test_samples_are_uniform(inserts: int):
+    """In a buffer that is part full, just full, and overwritten."""
+    replay = filled(24, *(numbered(8 * i, 8) for i in range(inserts)))
+    sample = np.ravel(replay.sample(jax.random.key(0), (100, 240)).reward)
+    numbers, counts = np.unique(sample, return_counts=True)
+    assert len(numbers) == min(8 * inserts, 24)
+    expected = len(sample) / len(numbers)
+    assert np.abs(counts - expected).max() < 4.5 * np.sqrt(expected)
+
+
+def test_a_batch_that_would_wrap_around_is_refused():
+    with pytest.raises(ValueError, match="capacity 10 is no multiple of the batch of 3"):
+        filled(10, numbered(0, 3))
+
+
+def test_insert_writes_in_place():
+    """Donated, the buffer stays where it is in memory, and the program has no room for a copy of it."""
+    replay, batch = filled(1 << 16, numbered(1, 8)), numbered(9, 8)
+    insert = jax.jit(lambda replay, batch: replay.insert(batch), donate_argnums=0).lower(replay, batch).compile()
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(replay.storage))
+    memory = insert.memory_analysis()
+    assert memory.alias_size_in_bytes >= size
+    assert memory.temp_size_in_bytes < size / 100
+
+    before = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(replay.storage)]
+    replay = insert(replay, batch)
+    assert [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(replay.storage)] == before
+    np.testing.assert_array_equal(replay.storage.reward[:17], [*range(1, 17), 0])
+
+
+def test_training_does_not_copy_the_replay_buffer():
+    """Within an epoch's loop too: what it needs beside its state does not grow with the buffer."""
+    temporary = []
+    for capacity in (1 << 10, 1 << 18):
+        config = replace(SMALL, replay_capacity=capacity)
+        agent = DDPG(Walk(), config, num_envs=16, episode_length=20, total_steps=100)
+        training = jax.eval_shape(agent.init, config, jax.random.key(0))
+        epoch = jax.jit(partial(agent.epoch, steps=10), donate_argnums=1).lower(config, training).compile()
+        temporary.append(epoch.memory_analysis().temp_size_in_bytes)
+    assert temporary[1] < temporary[0] + 4 * (1 << 18) / 10
+
+
+def test_capacity_is_rounded_up_to_whole_batches():
+    agent = DDPG(Walk(), replace(SMALL, replay_capacity=100), num_envs=16, episode_length=20, total_steps=100)
+    training = jax.eval_shape(agent.init, replace(SMALL, replay_capacity=100), jax.random.key(0))
+    assert training.replay.capacity == 112
+
+
+# Losses and updates
+
+
+def test_critic_loss_is_eq_4():
+    q, target = np.random.default_rng(0).normal(size=(2, 50))
+    weight = np.arange(50) % 3 > 0
+    loss = losses.critic_loss(jnp.array(q), jnp.array(target), jnp.ones(50))
+    assert loss == pytest.approx(np.mean((target - q) ** 2), rel=1e-5)
+    loss = losses.critic_loss(jnp.array(q), jnp.array(target), jnp.array(weight, float))
+    assert loss == pytest.approx(np.mean((target - q)[weight] ** 2), rel=1e-5)
+    # The target is a constant to the critic.
+    assert (jax.grad(losses.critic_loss, argnums=1)(jnp.array(q), jnp.array(target), jnp.ones(50)) == 0).all()
+
+
+def test_actor_loss_is_eq_5():
+    q = np.random.default_rng(0).normal(size=(50, 1))
+    weight = np.arange(50) % 3 > 0
+    assert losses.actor_loss(jnp.array(q), jnp.ones(50), 0.01) == pytest.approx(-np.mean(q), rel=1e-5)
+    loss = losses.actor_loss(jnp.array(q), jnp.array(weight, float), 0.01)
+    assert loss == pytest.approx(-np.mean(q[weight]), rel=1e-5)
+
+
+def test_heads_share_a_target_by_softmax():
+    q, temperature = np.random.default_rng(0).normal(size=(50, 4)), 0.7
+    share = np.exp(q / temperature) / np.exp(q / temperature).sum(1, keepdims=True)
+    loss, gradient = jax.value_and_grad(losses.actor_loss)(jnp.array(q), jnp.ones(50), temperature)
+    assert loss == pytest.approx(-np.mean((share * q).sum(1)), rel=1e-5)
+    np.testing.assert_allclose(gradient, -share / 50, atol=1e-6)
+
+
+def test_losses_without_anything_to_learn_from_are_zero():
+    assert losses.critic_loss(jnp.ones(3), jnp.zeros(3), jnp.zeros(3)) == 0
+    assert losses.actor_loss(jnp.ones((3, 2)), jnp.zeros(3), 0.01) == 0
+
+
+class Probe(Toy):
+    """Two actions; the critic's observation is not the actor's."""
+
+    action_size = 2
+
+    def first(self, key: jax.Array) -> jax.Array:
+        return jnp.zeros(3)
+
+    def reset(self, key: jax.Array):
+        state = super().reset(key)
+        return state.replace(obs={"state": jnp.zeros(3), "privileged_state": jnp.zeros(4)})
+
+
+class Bench(NamedTuple):
+    """An agent about to make its first update, on random data and with target networks of their own."""
+
+    agent: DDPG
+    config: DDPGConfig
+    training: Training
+    batch: Transition
+
+    def update(self, batch: Transition | None = None, **changes: Any) -> tuple[Training, dict[str, jax.Array]]:
+        config = replace(self.config, **changes)
+        return jax.jit(self.agent.update)(config, self.training, self.batch if batch is None else batch)
+
+
+@pytest.fixture(scope="module", params=[1, 3], ids=["one head", "three heads"])
+def bench(request: pytest.FixtureRequest) -> Bench:
+    config = replace(SMALL, heads=request.param, width=8, discount=0.9, tau=0.3, temperature=0.5, final_lr=1.0)
+    agent = DDPG(Probe(), config, num_envs=1, episode_length=10, total_steps=100)
+    training = agent.init(config, jax.random.key(0))
+    keys = iter(jax.random.split(jax.random.key(1), 1000))
+    shift = lambda params: jax.tree.map(lambda p: p + 0.3 * jax.random.normal(next(keys), p.shape), params)
+    training = training.replace(networks=jax.tree.map(shift, training.networks))
+
+    def observations() -> dict[str, jax.Array]:
+        return {
+            "state": jax.random.normal(next(keys), (32, 3)),
+            "privileged_state": jax.random.normal(next(keys), (32, 4)),
+        }
+
+    batch = Transition(
+        obs=observations(),
+        action=jax.random.uniform(next(keys), (32, 2), minval=-1),
+        reward=jax.random.normal(next(keys), (32,)),
+        next_obs=observations(),
+        terminal=(jnp.arange(32) % 4 == 0).astype(float),
+        weight=(jnp.arange(32) % 5 > 0).astype(float),
+    )
+    return Bench(agent, config, training, batch)
+
+
+def flat(tree: Any) -> np.ndarray:
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+
+
+def flat_rows(tree: Any, axes: int) -> np.ndarray:
+    """Jacobians of one output per row: leading axes kept, parameters flattened."""
+    return np.concatenate([np.reshape(leaf, (*leaf.shape[:axes], -1)) for leaf in jax.tree.leaves(tree)], -1)
+
+
+def gradient_used(optimiser: Any) -> np.ndarray:
+    """Adam's first moment after its first update is a tenth of the gradient."""
+    return flat(optimiser.mu) * 10
+
+
+def q_of(bench: Bench, critic: Any, privileged: jax.Array, action: jax.Array) -> jax.Array:
+    return bench.agent.critic.apply(critic, jnp.concatenate([privileged, action], -1))
+
+
+def test_critic_descends_eq_4(bench: Bench):
+    """R + gamma Q'(s', mu'(s')) - Q(s, a), squared; mu' the best of the heads, nothing beyond a terminal state."""
+    networks, batch, weight = bench.training.networks, bench.batch, np.asarray(bench.batch.weight)
+    beyond = bench.agent.actor.apply(networks.target_actor, batch.next_obs["state"])
+    privileged = batch.next_obs["privileged_state"]
+    bootstrap = np.max([q_of(bench, networks.target_critic, privileged, a) for a in beyond.swapaxes(0, 1)], axis=0)
+    target = batch.reward + 0.9 * (1 - batch.terminal) * bootstrap
+    q, slope = (
+        f(lambda critic: q_of(bench, critic, batch.obs["privileged_state"], batch.action))
+        for f in (lambda g: np.asarray(g(networks.critic)), lambda g: flat_rows(jax.jacobian(g)(networks.critic), 1))
+    )
+    expected = -2 * ((weight * (target - q)) @ slope) / weight.sum()
+
+    after, metrics = bench.update()
+    assert metrics["critic_loss"] == pytest.approx((weight * (target - q) ** 2).sum() / weight.sum(), rel=1e-4)
+    np.testing.assert_allclose(gradient_used(after.critic_optimiser), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_actor_ascends_eq_5(bench: Bench):
+    """grad_a Q(s, a) grad_theta mu(s); several heads weighted by their share of each target."""
+    networks, obs, weight = bench.training.networks, bench.batch.obs, np.asarray(bench.batch.weight)
+    actions = bench.agent.actor.apply(networks.actor, obs["state"])
+    mu_slope = flat_rows(jax.jacobian(lambda a: bench.agent.actor.apply(a, obs["state"]))(networks.actor), 3)
+    by_head = [
+        jax.value_and_grad(lambda a: q_of(bench, networks.critic, obs["privileged_state"], a).sum())(actions[:, h])[1]
+        for h in range(actions.shape[1])
+    ]
+    q = np.stack([q_of(bench, networks.critic, obs["privileged_state"], a) for a in actions.swapaxes(0, 1)], 1)
+    share = np.exp(q / 0.5) / np.exp(q / 0.5).sum(1, keepdims=True)
+    q_slope = np.stack(by_head, 1)
+    expected = -np.einsum("i,ih,iha,ihap->p", weight, share, q_slope, mu_slope) / weight.sum()
+
+    after, _ = bench.update()
+    np.testing.assert_allclose(gradient_used(after.actor_optimiser), expected, rtol=1e-3, atol=1e-6)
+    assert np.abs(expected).max() > 1e-3
+
+
+def test_the_policy_is_the_head_the_critic_prefers(bench: Bench):
+    networks, obs = bench.training.networks, bench.batch.obs
+    action, value = bench.agent.act(bench.config, networks.actor, networks.critic, obs)
+    actions = np.asarray(bench.agent.actor.apply(networks.actor, obs["state"]))
+    q = np.stack([q_of(bench, networks.critic, obs["privileged_state"], a) for a in actions.swapaxes(0, 1)], 1)
+    np.testing.assert_allclose(value, q.max(1), atol=1e-6)
+    np.testing.assert_array_equal(action, actions[np.arange(32), q.argmax(1)])
+    assert np.abs(actions).max() <= 1
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.3, 1.0])
+def test_target_networks_follow_by_tau(bench: Bench, tau: float):
+    before, (after, _) = bench.training.networks, bench.update(tau=tau)
+    for online, old, new in (
+        (after.networks.actor, before.target_actor, after.networks.target_actor),
+        (after.networks.critic, before.target_critic, after.networks.target_critic),
+    ):
+        np.testing.assert_allclose(flat(new), (1 - tau) * flat(old) + tau * flat(online), atol=1e-6)
+    assert np.abs(flat(after.networks.actor) - flat(before.actor)).max() > 1e-4
+
+
+def test_target_networks_start_equal():
+    agent = DDPG(Walk(), SMALL, num_envs=1, episode_length=10, total_steps=100)
+    networks = agent.init(SMALL, jax.random.key(0)).networks
+    assert_same_bits(networks.target_actor, networks.actor)
+    assert_same_bits(networks.target_critic, networks.critic)
+
+
+def test_adam_steps_are_each_networks_own_rate(bench: Bench):
+    """Adam's first step moves every weight by the step size against its gradient's sign."""
+    after, _ = bench.update(actor_lr=0.01, critic_lr=0.002)
+    for name, rate in (("actor", 0.01), ("critic", 0.002)):
+        gradient = gradient_used(getattr(after, f"{name}_optimiser"))
+        moved = flat(getattr(after.networks, name)) - flat(getattr(bench.training.networks, name))
+        large = np.abs(gradient) > 1e-4
+        assert large.mean() > 0.5
+        np.testing.assert_allclose(moved[large], -rate * np.sign(gradient[large]), rtol=2e-3)
+
+
+@pytest.mark.parametrize(("steps", "rate"), [(0, 1.0), (50, 0.6), (100, 0.2), (500, 0.2)])
+def test_step_sizes_fall_along_a_cosine(bench: Bench, steps: int, rate: float):
+    later = bench._replace(training=bench.training.replace(steps=jnp.int32(steps)))
+    after, _ = later.update(final_lr=0.2, actor_lr=0.01)
+    moved = np.abs(flat(after.networks.actor) - flat(bench.training.networks.actor))
+    assert moved.max() == pytest.approx(0.01 * rate, rel=1e-3)
+
+
+def test_weight_0_has_no_influence(bench: Bench):
+    """Whatever such transitions hold, and as if they had not been in the batch."""
+    batch, kept = bench.batch, np.asarray(bench.batch.weight) == 1
+    assert 0 < kept.sum() < 32
+    junk = lambda x: jnp.where(kept.reshape(-1, *[1] * (x.ndim - 1)), x, 1e3 * (1 + x))
+    poisoned = jax.tree.map(junk, batch).replace(weight=batch.weight)
+    (clean, _), (dirty, _) = bench.update(), bench.update(poisoned)
+    assert_same_bits(dirty, clean)
+
+    without, _ = bench.update(jax.tree.map(lambda x: x[kept], batch))
+    for name in ("actor_optimiser", "critic_optimiser"):
+        left, right = (gradient_used(getattr(t, name)) for t in (without, clean))
+        np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
+    everything, _ = bench.update(batch.replace(weight=jnp.ones(32)))
+    assert np.abs(gradient_used(everything.critic_optimiser) - gradient_used(clean.critic_optimiser)).max() > 1e-3
+
+
+def test_discount_0_never_looks_ahead(bench: Bench):
+    """Not even at a bootstrap value that is no number."""
+    hopeless = jax.tree.map(lambda x: x * jnp.nan, bench.training.networks.target_critic)
+    lost = bench._replace(
+        training=bench.training.replace(networks=bench.training.networks.replace(target_critic=hopeless))
+    )
+    after, metrics = lost.update(discount=0.0)
+    assert np.isfinite(metrics["critic_loss"])
+    assert_finite(after.networks.critic)
+
+
+def test_a_view_the_environment_cannot_give_is_refused():
+    with pytest.raises(UserError, match="--critic-view state"):
+        DDPG(Walk(), replace(SMALL, critic_view="outcome"), num_envs=1, episode_length=10, total_steps=100)
+
+
+# Collecting
+
+
+@pytest.mark.parametrize(("steps", "noise"), [(0, 0.3), (25, 0.25), (50, 0.2), (100, 0.1), (150, 0.1)])
+def test_noise_falls_linearly(steps: int, noise: float):
+    """As reported, and as seen in the actions taken."""
+    config = replace(SMALL, noise=0.3, final_noise=0.1, replay_capacity=8192)
+    agent = DDPG(Walk(), config, num_envs=8192, episode_length=10, total_steps=100)
+    training = agent.init(config, jax.random.key(0)).replace(steps=jnp.int32(steps))
+    after, metrics = agent.collect(config, training)
+    assert metrics["noise"] == pytest.approx(noise, rel=1e-5)
+    deviation = after.replay.storage.action - agent.candidates(training.networks.actor, training.env.obs)[:, 0]
+    assert np.std(deviation) == pytest.approx(noise, rel=0.03)
+    assert abs(np.mean(deviation)) < 0.02
+    assert after.steps == steps + 1
+
+
+def test_noisy_actions_stay_in_bounds():
+    config = replace(SMALL, noise=2.0, final_noise=2.0)
+    agent = DDPG(Walk(), config, num_envs=256, episode_length=10, total_steps=100)
+    training, _ = agent.collect(config, agent.init(config, jax.random.key(0)))
+    action = np.asarray(training.replay.storage.action[:256])
+    assert np.abs(action).max() == 1
+    assert (np.abs(action) < 1).any()
+
+
+@pytest.mark.parametrize(("end", "terminal"), [(np.inf, 0), (2.0, 1)])
+def test_what_is_stored_never_mixes_episodes(end: float, terminal: int):
+    """Walks of three steps, cut by the clock or ended by the environment: every next observation is one on."""
+    agent = DDPG(Walk(end=end), SMALL, num_envs=8, episode_length=3, total_steps=100)
+    collect = jax.jit(agent.collect)
+    training = agent.init(SMALL, jax.random.key(0))
+    for _ in range(12):
+        training, _ = collect(SMALL, training)
+    stored = jax.tree.map(lambda x: np.asarray(x[:96]), training.replay.storage)
+    here, there = stored.obs["state"][:, 0], stored.next_obs["state"][:, 0]
+    np.testing.assert_allclose(there, here + 1, atol=1e-6)
+    np.testing.assert_allclose(stored.reward, there, atol=1e-6)
+    np.testing.assert_array_equal(stored.terminal, terminal * (here > 2 - 1e-6) if terminal else np.zeros(96))
+    np.testing.assert_array_equal(stored.weight, 1)
+    assert training.replay.size == 96
+    starts = here[here < 1]
+    assert len(starts) == len(np.unique(starts)) == 32
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_an_environment_that_blows_up_does_not_poison_the_networks(poison: float):
+    config = replace(SMALL, discount=0.5)
+    agent = DDPG(Walk(cliff=3, poison=poison), config, num_envs=16, episode_length=100, total_steps=60)
+    training, metrics = jax.jit(agent.epoch, static_argnums=2)(config, agent.init(config, jax.random.key(0)), 60)
+    assert training.updates > 400
+    # Each walk falls at its third step.
+    assert metrics["nonfinite"] == 16 * 60 / 3
+    assert (training.replay.storage.weight[:960] == 0).sum() == metrics["nonfinite"]
+    assert_finite(training.networks)
+    assert_finite(training.replay.storage)
+    assert_finite((training.actor_optimiser, training.critic_optimiser, metrics))
+
+
+# Known answers
+
+
+class Run(NamedTuple):
+    """Members of a population after training: leading axis the member."""
+
+    agent: DDPG
+    config: DDPGConfig
+    training: Training
+
+    def policy(self, obs: np.ndarray) -> np.ndarray:
+        """Each member's actions for observations (n, size): (members, n, action_size)."""
+        obs = {"state": jnp.array(obs), "privileged_state": jnp.array(obs)}
+        act = lambda n: self.agent.act(self.config, n.actor, n.critic, obs)[0]
+        return np.asarray(jax.vmap(act)(self.training.networks))
+
+    def q(self, obs: np.ndarray, action: np.ndarray) -> np.ndarray:
+        view = jnp.concatenate([jnp.array(obs), jnp.array(action)], -1)
+        return np.asarray(jax.vmap(lambda n: self.agent.critic.apply(n.critic, view))(self.training.networks))
+
+
+def train(env: Toy, steps: int, length: int = 10, **changes: Any) -> Run:
+    """Train four seeds; a hyperparameter may be an array of four."""
+    config = replace(SMALL, final_lr=0.1, **changes)
+    agent = DDPG(env, config, num_envs=16, episode_length=length, total_steps=steps)
+
+    def run(config: DDPGConfig, key: jax.Array) -> Training:
+        return agent.epoch(config, agent.init(config, key), steps)[0]
+
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, config)
+    return Run(agent, config, jax.jit(jax.vmap(run, (axes, 0)))(config, jax.random.split(jax.random.key(0), 4)))
+
+
+@pytest.mark.parametrize("heads", [1, 4])
+def test_bandit_is_solved(heads: int):
+    run = train(Bandit(), steps=150, heads=heads)
+    s = np.linspace(-0.7, 0.7, 15)[:, None]
+    assert np.abs(run.policy(s) - s).max() < 0.1
+    s, a = (x.reshape(-1, 1) for x in np.meshgrid(s, np.linspace(-0.9, 0.9, 11)))
+    assert np.abs(run.q(s, a) + ((a - s) ** 2)[:, 0]).max() < 0.3
+    assert np.abs(run.q(s, a) + ((a - s) ** 2)[:, 0]).mean() < 0.03
+
+
+def test_loan_is_taken_as_far_as_the_discount_allows():
+    """One program, four discounts: how much to borrow is the discount itself."""
+    gamma = np.array([0.0, 0.3, 0.6, 0.9])
+    run = train(Loan(), steps=300, discount=jnp.array(gamma), tau=0.05)
+    action = run.policy(np.zeros((1, 2)))[:, 0, 0]
+    np.testing.assert_allclose(action, gamma, atol=0.12)
+    borrowed = np.linspace(-0.5, 0.9, 8)
+    late = np.stack([np.ones(8), borrowed], 1)
+    np.testing.assert_allclose(run.q(late, np.zeros((8, 1))), np.tile(2 * borrowed, (4, 1)), atol=0.2)
+    first = np.array([run.q(np.zeros((1, 2)), np.array([[a]]))[:, 0] for a in (-0.5, 0.0, 0.5)]).T
+    wanted = np.array([[-(a**2) + 2 * g * a for a in (-0.5, 0.0, 0.5)] for g in gamma])
+    np.testing.assert_allclose(first, wanted, atol=0.2)
+
+
+@pytest.mark.parametrize("length", [1, 7])
+def test_a_time_limit_is_bootstrapped_through(length: int):
+    """For ever 1 is worth 1 / (1 - 0.8) = 5, even where every single step is cut off by the clock."""
+    run = train(Salary(), steps=300, length=length, discount=0.8, tau=0.05)
+    np.testing.assert_allclose(run.q(np.zeros((1, 1)), np.zeros((1, 1))), 5, rtol=0.05)
+
+
+def test_a_terminal_state_is_not_bootstrapped_through():
+    """Three years of pay at 0.8: 1 + 0.8 + 0.64, then 1 + 0.8, then 1."""
+    run = train(Salary(years=3), steps=300, discount=0.8, tau=0.05)
+    served = np.array([[0], [1 / 3], [2 / 3]])
+    np.testing.assert_allclose(run.q(served, np.zeros((3, 1))), np.tile([2.44, 1.8, 1.0], (4, 1)), rtol=0.05)
+
+
+# Populations and repeatability
+
+
+def test_a_population_is_its_members_alone():
+    """`vmap` over seeds and step sizes against runs of their own."""
+    agent = DDPG(Bandit(), SMALL, num_envs=16, episode_length=10, total_steps=20)
+    rates, keys = jnp.array([1e-3, 3e-3, 1e-2]), jax.random.split(jax.random.key(0), 3)
+
+    def run(rate: jax.Array, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        config = replace(SMALL, actor_lr=rate, critic_lr=rate)
+        training, metrics = agent.epoch(config, agent.init(config, key), 20)
+        return training.networks, metrics
+
+    together = jax.jit(jax.vmap(run))(rates, keys)
+    alone = jax.jit(run)
+    for i in range(3):
+        for left, right in zip(
+            jax.tree.leaves(member(together, i)), jax.tree.leaves(alone(rates[i], keys[i])), strict=True
+        ):
+            np.testing.assert_allclose(left, right, atol=2e-3, rtol=1e-3)
+    first, second = (flat(member(together[0].actor, i)) for i in (0, 1))
+    assert np.abs(first - second).max() > 0.1
+
+
+def test_same_seed_same_bits():
+    agent = DDPG(Walk(), SMALL, num_envs=16, episode_length=7, total_steps=40)
+    run = jax.jit(lambda key: agent.epoch(SMALL, agent.init(SMALL, key), 20))
+    first, second, other = (run(jax.random.key(seed)) for seed in (1, 1, 2))
+    assert_same_bits(first, second)
+    assert np.abs(flat(first[0].networks) - flat(other[0].networks)).max() > 0.1
+
+
+def test_two_short_epochs_are_a_long_one():
+    """Nothing is lost between epochs."""
+    agent = DDPG(Walk(), replace(SMALL, discount=0.5), num_envs=16, episode_length=7, total_steps=40)
+    epoch = jax.jit(agent.epoch, static_argnums=2)
+    start = agent.init(SMALL, jax.random.key(0))
+    long, _ = epoch(SMALL, start, 20)
+    short, _ = epoch(SMALL, epoch(SMALL, start, 10)[0], 10)
+    assert (long.steps, long.updates, long.replay.size) == (20, 17 * 8, 320)
+    assert_same_bits(short, long)
+
+
+# Arms
+
+
+class Learnt(NamedTuple):
+    env: Reach
+    agent: DDPG
+    config: DDPGConfig
+    before: Training
+    after: Training
+    metrics: dict[str, jax.Array]
+    epoch: Any
+
+    def median(self, training: Training) -> np.ndarray:
+        """Median one-shot error of each member over 500 fresh targets, metres."""
+        goals = jax.vmap(self.env.sample_goal)(jax.random.split(jax.random.key(99), 500))
+        ask = lambda networks: Policy(self.env, self.agent, self.config, networks)(goals).error
+        return np.median(jax.jit(jax.vmap(ask))(training.networks), axis=1)
+
+
+def learn(env: Reach, seeds: int, steps: int) -> Learnt:
+    config = DDPGConfig(batch_size=128, updates_per_step=16, width=64, depth=2, replay_capacity=4096)
+    agent = DDPG(env, config, num_envs=32, episode_length=20, total_steps=steps)
+    before = jax.jit(jax.vmap(agent.init, (None, 0)))(config, jax.random.split(jax.random.key(0), seeds))
+    epoch = jax.jit(jax.vmap(partial(agent.epoch, steps=steps), (None, 0)))
+    return Learnt(env, agent, config, before, *epoch(config, before), epoch)
+
+
+@pytest.fixture(scope="module")
+def paper_arm(kinematic: Reach) -> Learnt:
+    return learn(kinematic, seeds=3, steps=80)
+
+
+@pytest.fixture(scope="module")
+def seven_joints() -> Learnt:
+    return learn(Reach(load(seven_dof()), ReachConfig(dynamics="servo")), seeds=2, steps=60)
+
+
+def test_the_papers_arm_learns(paper_arm: Learnt):
+    before, after = paper_arm.median(paper_arm.before), paper_arm.median(paper_arm.after)
+    assert before.min() > 0.1
+    assert (after < before / 4).all(), (before, after)
+    assert (paper_arm.metrics["nonfinite"] == 0).all()
+
+
+def test_seven_joints_learn_with_the_same_code(seven_joints: Learnt):
+    before, after = seven_joints.median(seven_joints.before), seven_joints.median(seven_joints.after)
+    assert before.min() > 0.2
+    assert (after < before / 4).all(), (before, after)
+
+
+def test_an_arm_that_blows_up_does_not_poison_the_networks(seven_joints: Learnt):
+    """One arm's physics starts as NaN, in the first member only: reset, counted, not learnt from."""
+    data = seven_joints.before.env.data
+    sick = data.replace(qpos=data.qpos.at[0, 5].set(jnp.nan))
+    before = seven_joints.before.replace(env=seven_joints.before.env.replace(data=sick))
+    after, metrics = seven_joints.epoch(seven_joints.config, before)
+    np.testing.assert_array_equal(metrics["nonfinite"], [1, 0])
+    assert (after.replay.storage.weight[0] == 0).sum() == 1 + (after.replay.capacity - after.replay.size[0])
+    assert_finite(after.networks)
+    assert_finite(after.replay.storage)
+    assert_same_bits(member(after.networks, 1), member(seven_joints.after.networks, 1))
+    assert (seven_joints.median(after) < seven_joints.median(before) / 4).all()
+
+
+# Hindsight, on what the paper's arm has stored
+
+
+def goal_in(env: Reach, obs: dict[str, jax.Array]) -> np.ndarray:
+    return np.asarray(obs["privileged_state"][..., -3:]) * env.arm.reach + env.arm.origin
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_relabelling_is_exact(paper_arm: Learnt, share: float):
+    env, agent = paper_arm.env, paper_arm.agent
+    replay = member(paper_arm.after.replay, 0)
+    shape = (4, 1000)
+    batch = replay.sample(jax.random.key(1), shape)
+    new = jax.jit(agent.relabel)(replace(paper_arm.config, relabel=share), replay, batch, jax.random.key(2))
+
+    old_goal, goal = goal_in(env, batch.obs), goal_in(env, new.obs)
+    changed = (np.abs(goal - old_goal) > 1e-6).any(-1)
+    # Six standard deviations of a binomial share.
+    assert abs(changed.mean() - share) <= 6 * np.sqrt(share * (1 - share) / 4000)
+    assert_same_bits(jax.tree.map(lambda x: x[~changed], new), jax.tree.map(lambda x: x[~changed], batch))
+
+    # Rewards are Eq. 7 for the goal that the transition now has.
+    reached = np.asarray(agent.goal_env.arm.forward(env.arm.to_joints(batch.next_obs["privileged_state"][..., :5])))
+    np.testing.assert_allclose(new.reward, -np.linalg.norm(reached - goal, axis=-1), atol=2e-6)
+    np.testing.assert_allclose(goal_in(env, new.next_obs), goal, atol=1e-6)
+
+    # Nothing but the goal has changed, for actor and critic alike.
+    for left, right in ((new.obs, batch.obs), (new.next_obs, batch.next_obs)):
+        np.testing.assert_array_equal(left["privileged_state"][..., :8], right["privileged_state"][..., :8])
+        np.testing.assert_allclose(left["state"], left["privileged_state"][..., -3:], atol=1e-6)
+    for name in ("action", "terminal", "weight"):
+        np.testing.assert_array_equal(getattr(new, name), getattr(batch, name))
+
+    # New goals are points that were reached.
+    points = np.asarray(jax.vmap(env.achieved)(replay.storage.next_obs))[: int(replay.size)]
+    for point in goal[changed][:200]:
+        assert np.linalg.norm(points - point, axis=1).min() < 1e-6
+
+
+def test_relabelled_goals_are_as_many_as_transitions(paper_arm: Learnt):
+    """Each transition gets a goal of its own."""
+    replay = member(paper_arm.after.replay, 0)
+    batch = replay.sample(jax.random.key(1), (2, 100))
+    new = paper_arm.agent.relabel(replace(paper_arm.config, relabel=1.0), replay, batch, jax.random.key(2))
+    goals = goal_in(paper_arm.env, new.obs).reshape(-1, 3)
+    assert len(np.unique(goals, axis=0)) > 180
+
+
+def test_environments_without_goals_are_left_alone():
+    agent = DDPG(Walk(), SMALL, num_envs=1, episode_length=10, total_steps=100)
+    replay = filled(8, numbered(0, 8))
+    batch = replay.sample(jax.random.key(0), (4,))
+    assert_same_bits(agent.relabel(replace(SMALL, relabel=1.0), replay, batch, jax.random.key(1)), batch)
