@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,7 +35,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, read_only: bool = False) -> None:
         self.folder = folder
-        logging.getLogger("absl").setLevel(logging.ERROR)
+        logging.getLogger("absl").setLevel(logging.CRITICAL)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=KEEP,
             enable_async_checkpointing=False,
@@ -138,11 +139,19 @@ def _describe(leaves: dict[str, Any]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _as_user_error(message: str) -> Iterator[None]:
-    """Orbax and tensorstore raise many types for a bad file or a full disk; to the user they are one."""
+    """Orbax and tensorstore raise many types for a bad file or a full disk; to the user they are one.
+
+    After one failure the rest of tensorstore's threads fail too, each with a traceback about its closed event loop.
+    """
+    report = sys.unraisablehook
+    sys.unraisablehook = lambda failure: None if "loop is closed" in str(failure.exc_value) else report(failure)
     try:
         yield
     except UserError:
         raise
     except Exception as error:
-        reason = (str(error) or type(error).__name__).strip().splitlines()[0][:200]
+        reason = (str(error) or type(error).__name__).strip().splitlines()[0].split(" [source")[0]
+        reason = reason if len(reason) < 160 else "..." + reason[-160:]
         raise UserError(f"{message} ({reason})") from error
+    else:
+        sys.unraisablehook = report

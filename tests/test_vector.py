@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,12 @@ from environments import Bandit, Walk
 from arm5dof.envs import Reach, State, VectorEnv
 
 ENVS, LENGTH = 16, 5
+
+
+def bits(tree: Any) -> Any:
+    """A pytree as numpy arrays, random keys as the numbers they are made of."""
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if is_key(x) else x), tree)
 
 
 class Episodes:
@@ -93,7 +100,7 @@ def test_the_marker_moves_with_the_goal(kinematic: Reach, episodes: list[State])
 
 def test_the_terminal_observation_is_kept(reach: Episodes, episodes: list[State]):
     """`next_obs` and `reward` are the bare environment's, also where `obs` is already the next episode's."""
-    for t, (before, after) in enumerate(zip(episodes[:-1], episodes[1:], strict=True)):
+    for t, (before, after) in enumerate(pairwise(episodes)):
         reached = reach.bare_step(before, reach.action(t))
         for name, value in reached.obs.items():
             np.testing.assert_allclose(after.info["next_obs"][name], value, atol=1e-6)
@@ -138,9 +145,6 @@ def test_environments_end_one_by_one():
 
 
 def test_same_keys_same_bits(reach: Episodes, episodes: list[State]):
-    def bits(state: State) -> State:
-        return state.replace(info={**state.info, "key": jax.random.key_data(state.info["key"])})
-
     again = reach.run(LENGTH + 1)[-1]
     jax.tree.map(np.testing.assert_array_equal, bits(again), bits(episodes[LENGTH + 1]))
 
@@ -173,10 +177,8 @@ def test_nan_in_one_arm_leaves_the_others_alone(physics: Episodes, field: str):
     poisoned = getattr(healthy.data, field).at[victim, 1].set(jnp.nan)
     sick = healthy.replace(data=healthy.data.replace(**{field: poisoned}))
     sound = np.arange(physics.envs) != victim
-    pick = partial(jax.tree.map, lambda x: np.asarray(x if x.dtype != jax.random.key(0).dtype else x._base_array))
 
-    step = lambda state: pick(physics.step(state, physics.action(2)))
-    after, reference = step(sick), step(healthy)
+    after, reference = (bits(physics.step(state, physics.action(2))) for state in (sick, healthy))
     np.testing.assert_array_equal(after.info["nonfinite"], ~sound)
     np.testing.assert_array_equal(after.done, ~sound)
     assert (after.info["steps"][victim], after.info["truncation"][victim], after.reward[victim]) == (0, 0, 0)
