@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import math
 import sys
@@ -12,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from arm5dof import __version__, files, xla
+from arm5dof import __version__, files, targets_csv, xla
 from arm5dof.errors import UserError
 
 TRAIN_HELP = """\
@@ -76,8 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"arm5dof: {error}", file=sys.stderr)
     except OSError as error:
-        place = f" {error.filename}" if error.filename else ""
-        print(f"arm5dof: {error.strerror or error}:{place}; what was complete is kept", file=sys.stderr)
+        place = f": {error.filename}" if error.filename else ""
+        print(f"arm5dof: {error.strerror or error}{place}; what was complete is kept", file=sys.stderr)
     except KeyboardInterrupt:
         print("arm5dof: interrupted; go on with arm5dof train --resume RUN", file=sys.stderr)
         return 130
@@ -158,7 +156,7 @@ def solve(known: argparse.Namespace, rest: list[str]) -> int:
             angles = "  ".join(f"{name} {math.degrees(value):.2f}" for name, value in row["joints_rad"].items())
             print(f"{target} mm:  {angles} degrees  error {row['error_mm']:.2f} mm")
     if known.csv is not None and not (known.json and known.out is None):
-        text = _answers_csv(rows, known.tolerance_mm)
+        text = targets_csv.write(rows, known.tolerance_mm)
         sys.stdout.write(text) if known.out is None else files.write_text(known.out, text)
     if not reached.all():
         worst = int(error.argmax())
@@ -256,40 +254,11 @@ def _targets(known: argparse.Namespace) -> list[list[float]]:
     """Targets (n, 3) in metres from the command line or a CSV, all finite."""
     if (known.csv is None) == (known.target is None):
         raise UserError("give either --target X Y Z (metres) or --csv FILE")
-    targets = known.target if known.csv is None else _read_csv(known.csv)
+    targets = known.target if known.csv is None else targets_csv.read(known.csv)
     for i, target in enumerate(targets, 1):
         if not all(map(math.isfinite, target)):
             raise UserError(f"target {i} is not finite: {' '.join(map(str, target))}")
     return targets
-
-
-def _read_csv(path: Path) -> list[list[float]]:
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as handle:
-            reader = csv.DictReader(handle)
-            if not {"x", "y", "z"} <= set(reader.fieldnames or ()):
-                raise UserError(f"{path} needs a header with x, y and z (metres)")
-            targets = []
-            for row in reader:
-                try:
-                    targets.append([float(row[axis]) for axis in "xyz"])
-                except (TypeError, ValueError):
-                    raise UserError(f"{path}, line {reader.line_num}: x, y and z must be numbers") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path} is not a CSV file: {error}") from None
-    if not targets:
-        raise UserError(f"{path} holds no targets")
-    return targets
-
-
-def _answers_csv(rows: list[dict[str, Any]], tolerance_mm: float) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["x", "y", "z", *rows[0]["joints_rad"], "error_mm", "reached"])
-    for row in rows:
-        angles = [f"{value:.7f}" for value in row["joints_rad"].values()]
-        writer.writerow([*row["target_m"], *angles, f"{row['error_mm']:.4f}", int(row["error_mm"] <= tolerance_mm)])
-    return text.getvalue()
 
 
 def _positive(text: str) -> int:
