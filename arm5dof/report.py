@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,39 +44,53 @@ def headline(config: Config) -> str:
 
 def write(folder: Path, config: Config, rows: list[dict[str, Any]], evaluations: list[dict[str, Any]]) -> None:
     """Write the figures and `report.md` into a run's folder."""
-    episodes = np.array([float(row["env_steps"]) for row in rows]) / config.env.episode_length
-    reward = np.array([float(row["reward"]) for row in rows])
-    distance = np.array([float(row["distance"]) for row in rows])
+    curve = {
+        name: np.array([float(row[name]) for row in rows]) for name in ("env_steps", "distance", "policy_distance")
+    }
     with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
-        save(figure_7(episodes, reward), folder / "figure_7_reward.png")
-        save(figure_8(episodes, distance, evaluations, headline(config)), folder / "figure_8_error.png")
+        save(figure_7(curve, config.env.episode_length), folder / "figure_7_reward.png")
+        save(figure_8(curve, config.env.episode_length, evaluations, headline(config)), folder / "figure_8_error.png")
     files.write_text(folder / "report.md", markdown(folder.name, config, rows, evaluations))
 
 
-def figure_7(episodes: np.ndarray, reward: np.ndarray) -> Figure:
-    """The paper's Figure 7: reward against episodes, normalised to [0, 1] between the worst and zero distance."""
+Curve = Mapping[str, np.ndarray] | np.ndarray
+"""Columns of `metrics.csv` by name, as a dictionary or a structured array."""
+
+
+def figure_7(curve: Curve, episode_length: int) -> Figure:
+    """The paper's Figure 7: reward (Eq. 7) against episodes, normalised to 0 at its first value and 1 at no distance."""
     figure, axes = _axes("normalised reward")
-    axes.plot(episodes, 1 - reward / reward.min(), color=BLUE, lw=1.8)
-    axes.set_ylim(0, 1.02)
-    axes.set_title("Reward while exploring (Figure 7)", loc="left", color=INK)
+    _plot(axes, curve, episode_length, lambda distance, first: 1 - distance / first)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_title("Reward (Figure 7)", loc="left", color=INK)
+    axes.legend(frameon=False, loc="lower right")
     return figure
 
 
-def figure_8(episodes: np.ndarray, distance: np.ndarray, evaluations: list[dict[str, Any]], name: str) -> Figure:
+def figure_8(curve: Curve, episode_length: int, evaluations: list[dict[str, Any]], name: str) -> Figure:
     """The paper's Figure 8: distance between end effector and object against episodes, normalised by its first
-    value; and the greedy policy's median error on unseen targets, in millimetres."""
-    figure, axes = _axes("normalised error while exploring")
-    axes.plot(episodes, distance / distance[0], color=BLUE, lw=1.8)
+    value; and the policy's median error on unseen targets, in millimetres."""
+    figure, axes = _axes("normalised error")
+    _plot(axes, curve, episode_length, lambda distance, first: distance / first)
     axes.set_ylim(0, 1.05)
-    axes.yaxis.label.set_color(BLUE)
     axes.set_title("Distance between end effector and object (Figure 8)", loc="left", color=INK)
     right = axes.twinx()
     right.grid(False)
     right.spines["right"].set_visible(True)
-    right.plot([e["episodes"] for e in evaluations], [e[name]["median_mm"] for e in evaluations], "o-", color=ORANGE)
-    right.set_ylabel(f"median error of the policy, mm ({name})", color=ORANGE)
+    median = [e[name]["median_mm"] for e in evaluations]
+    right.plot([e["episodes"] for e in evaluations], median, "o", color=ORANGE, label=f"median, mm ({name})")
+    right.set_ylabel(f"median error on unseen targets, mm ({name})", color=ORANGE)
     right.set_ylim(bottom=0)
+    axes.legend(frameon=False, loc="upper right")
     return figure
+
+
+def _plot(axes: Any, curve: Curve, episode_length: int, normalise: Callable[..., np.ndarray]) -> None:
+    """Both distances, while exploring and without noise, normalised by the first one while exploring."""
+    episodes, first = curve["env_steps"] / episode_length, curve["distance"][0]
+    exploring, policy = normalise(curve["distance"], first), normalise(curve["policy_distance"], first)
+    axes.plot(episodes, exploring, color=BLUE, alpha=0.35, lw=1.5, label="while exploring, noise included")
+    axes.plot(episodes, policy, color=BLUE, lw=2, label="the policy without noise")
 
 
 def table_2(config: Config, evaluations: list[dict[str, Any]]) -> str:

@@ -149,7 +149,7 @@ def _evaluate(run: Run, trainer: training.Trainer, bar: Bar) -> dict[str, Any]:
 
 
 def _note(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
-    """Rates over the last few epochs, and the error while exploring."""
+    """Rates over the last few epochs, and the policy's mean error."""
     recent = rows[-6:]
     if len(recent) < 2:
         return ""
@@ -158,7 +158,7 @@ def _note(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
     rate = {name: (float(last[name]) - float(first[name])) / elapsed for name in ("env_steps", "updates")}
     return (
         f"{rate['env_steps']:.0f} env steps/s  {rate['updates']:.0f} updates/s  "
-        f"error {1e3 * metrics['distance']:.1f} mm while exploring"
+        f"error {1e3 * metrics['policy_distance']:.1f} mm"
     )
 
 

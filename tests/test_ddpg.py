@@ -34,6 +34,10 @@ SMALL = DDPGConfig(
 )
 
 
+# Most of these tests' time is compilation; less optimised, it takes half.
+quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
+
+
 def bits(tree: Any) -> Any:
     """A pytree as numpy arrays, random keys as the numbers they are made of."""
     is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
@@ -420,7 +424,8 @@ def test_what_is_stored_never_mixes_episodes(end: float, terminal: int):
 def test_an_environment_that_blows_up_does_not_poison_the_networks():
     config = replace(SMALL, discount=0.5)
     agent = DDPG(Walk(cliff=3), config, num_envs=16, episode_length=100, total_steps=60)
-    training, metrics = jax.jit(agent.epoch, static_argnums=2)(config, agent.init(config, jax.random.key(0)), 60)
+    training = quick_jit(agent.init)(config, jax.random.key(0))
+    training, metrics = quick_jit(agent.epoch, static_argnums=2)(config, training, 60)
     assert training.updates > 400
     # Each walk falls at its third step.
     assert metrics["nonfinite"] == 16 * 60 / 3
@@ -464,8 +469,8 @@ def train(env: Toy, epochs: int, length: int = 10, **changes: Any) -> Population
     config = replace(SMALL, final_lr=0.1, tau=0.05, **changes)
     agent = DDPG(env, config, num_envs=16, episode_length=length, total_steps=EARLY * epochs)
     axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, config)
-    epoch = jax.jit(jax.vmap(lambda config, training: agent.epoch(config, training, EARLY)[0], (axes, 0)))
-    early = training = epoch(config, jax.jit(jax.vmap(agent.init, (axes, 0)))(config, SEEDS))
+    epoch = quick_jit(jax.vmap(lambda config, training: agent.epoch(config, training, EARLY)[0], (axes, 0)))
+    early = training = epoch(config, quick_jit(jax.vmap(agent.init, (axes, 0)))(config, SEEDS))
     for _ in range(epochs - 1):
         training = epoch(config, training)
     return Population(agent, config, early, training)
@@ -477,9 +482,8 @@ def borrowers() -> Population:
     return train(Loan(), 15, discount=jnp.array([0.0, 0.3, 0.6, 0.9]), actor_lr=jnp.array([2e-3, 3e-3, 4e-3, 5e-3]))
 
 
-@pytest.mark.parametrize("heads", [1, 4])
-def test_bandit_is_solved(heads: int):
-    run = train(Bandit(), 8, heads=heads)
+def test_bandit_is_solved():
+    run = train(Bandit(), 8, heads=3)
     s = np.linspace(-0.7, 0.7, 15)[:, None]
     assert np.abs(run.policy(s) - s).max() < 0.1
     s, a = (x.reshape(-1, 1) for x in np.meshgrid(s, np.linspace(-0.9, 0.9, 11)))
@@ -501,7 +505,7 @@ def test_loan_is_taken_as_far_as_the_discount_allows(borrowers: Population):
 def test_a_population_is_its_members_alone(borrowers: Population):
     """`vmap` over seeds, discounts and step sizes, against a run of its own for each."""
     agent, config = borrowers.agent, borrowers.config
-    alone = jax.jit(lambda config, key: agent.epoch(config, agent.init(config, key), EARLY)[0])
+    alone = quick_jit(lambda config, key: agent.epoch(config, agent.init(config, key), EARLY)[0])
     for i, key in enumerate(SEEDS):
         one = alone(replace(config, discount=config.discount[i], actor_lr=config.actor_lr[i]), key)
         assert one.updates == 17 * config.updates_per_step
@@ -534,7 +538,7 @@ def walker() -> Any:
     """Epochs of any length of an agent that looks ahead, from a seed."""
     config = replace(SMALL, discount=0.5)
     agent = DDPG(Walk(), config, num_envs=16, episode_length=7, total_steps=40)
-    init, epoch = jax.jit(agent.init), jax.jit(agent.epoch, static_argnums=2)
+    init, epoch = quick_jit(agent.init), quick_jit(agent.epoch, static_argnums=2)
 
     def run(seed: int, *epochs: int) -> Training:
         training = init(config, jax.random.key(seed))
@@ -573,14 +577,14 @@ class Learnt(NamedTuple):
 
     def median(self, training: Training) -> np.ndarray:
         """Each seed's median one-shot error over 1,000 fresh targets, metres."""
-        goals = self.env.arm.forward(self.env.arm.sample(jax.random.key(99), (1000,)))
-        obs = jax.vmap(self.env.relabel, (None, 0))(member(member(training.env.obs, 0), 0), goals)
 
-        def error(networks: Networks) -> jax.Array:
+        def errors(networks: Networks) -> jax.Array:
+            goals = self.env.arm.forward(self.env.arm.sample(jax.random.key(99), (1000,)))
+            obs = jax.vmap(self.env.relabel, (None, 0))(member(member(training.env.obs, 0), 0), goals)
             action, _ = self.agent.act(self.config, networks.actor, networks.critic, obs)
             return jnp.linalg.norm(self.env.arm.forward(self.env.arm.to_joints(action)) - goals, axis=-1)
 
-        return np.median(jax.vmap(error)(training.networks), axis=1)
+        return np.median(quick_jit(jax.vmap(errors))(training.networks), axis=1)
 
 
 def learn(env: Reach, seeds: int, steps: int) -> Learnt:
@@ -588,8 +592,8 @@ def learn(env: Reach, seeds: int, steps: int) -> Learnt:
     agent = DDPG(env, config, num_envs=32, episode_length=20, total_steps=steps)
     keys = jax.random.split(jax.random.key(0), seeds)
     # One seed after another: networks this small gain nothing from `vmap` on a CPU, and it takes longer to compile.
-    before = jax.jit(lambda keys: jax.lax.map(partial(agent.init, config), keys))(keys)
-    epoch = jax.jit(lambda training: jax.lax.map(lambda t: agent.epoch(config, t, steps), training))
+    before = quick_jit(lambda keys: jax.lax.map(partial(agent.init, config), keys))(keys)
+    epoch = quick_jit(lambda training: jax.lax.map(lambda t: agent.epoch(config, t, steps), training))
     return Learnt(env, agent, config, before, *epoch(before))
 
 

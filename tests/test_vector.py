@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -16,6 +17,10 @@ from arm5dof.envs import Reach, State, VectorEnv
 ENVS, LENGTH = 16, 5
 
 
+# Most of these tests' time is compilation; less optimised, it takes half.
+quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
+
+
 def bits(tree: Any) -> Any:
     """A pytree as numpy arrays, random keys as the numbers they are made of."""
     is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
@@ -28,7 +33,8 @@ class Episodes:
     def __init__(self, env, length: int = LENGTH, envs: int = ENVS) -> None:
         self.env, self.envs = env, envs
         vector = VectorEnv(env, length)
-        self.reset, self.step, self.bare_step = jax.jit(vector.reset), jax.jit(vector.step), jax.jit(jax.vmap(env.step))
+        self.reset, self.step = quick_jit(vector.reset), quick_jit(vector.step)
+        self.bare_step = quick_jit(jax.vmap(env.step))
 
     def run(self, steps: int, seed: int = 0) -> list[State]:
         """The first state and those after each step of random actions."""
