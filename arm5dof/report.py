@@ -58,7 +58,7 @@ Curve = Mapping[str, np.ndarray] | np.ndarray
 
 
 def figure_7(curve: Curve, episode_length: int) -> Figure:
-    """The paper's Figure 7: reward (Eq. 7) against episodes, normalised to 0 at its first value and 1 at no distance."""
+    """The paper's Figure 7: reward (Eq. 7) against episodes, 0 at its first value and 1 at no distance."""
     figure, axes = _axes("normalised reward")
     _plot(axes, curve, episode_length, lambda distance, first: 1 - distance / first)
     axes.set_ylim(-0.02, 1.02)
