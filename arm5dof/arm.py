@@ -150,7 +150,9 @@ def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
             raise UserError(f'joint {name!r} has no limits: give it range="LOWER UPPER" in the MJCF')
 
     chain = _chain(model, path, site_id)
-    slides = np.abs(model.jnt_range[ids][model.jnt_type[ids] == SLIDE]).max(-1, initial=0).sum()
+    slides = ids[model.jnt_type[ids] == SLIDE]
+    zero = model.qpos0[model.jnt_qposadr[slides]]
+    travel = np.abs(model.jnt_range[slides] - zero[:, None]).max(-1, initial=0) + np.abs(zero)
     return Arm(
         mj_model=model,
         mjx_model=mjx.put_model(model),
@@ -163,7 +165,7 @@ def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
         upper=model.jnt_range[ids, 1].copy(),
         rest=model.qpos0.copy(),
         chain=chain,
-        reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + slides),
+        reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + travel.sum()),
     )
 
 
@@ -227,7 +229,9 @@ def _position_actuator(model: mujoco.MjModel, joint: int) -> int:
     """Id of the actuator that servoes a joint's position, or -1."""
     for a in range(model.nu):
         on_joint = model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and model.actuator_trnid[a, 0] == joint
-        if on_joint and model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE):
+        # A velocity servo has an affine bias too, but none that grows with position.
+        affine = model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        if on_joint and affine and model.actuator_biasprm[a, 1]:
             return a
     return -1
 

@@ -24,7 +24,10 @@ class State(struct.PyTreeNode):
 
 
 class Env(Protocol):
-    """A pure environment without a batch axis. Actions are vectors in [-1, 1]."""
+    """A pure environment without a batch axis. Actions are vectors in [-1, 1].
+
+    `step` sets `done` if the episode has ended for good, and keeps the entries of `info` that it does not know.
+    """
 
     @property
     def action_size(self) -> int: ...

@@ -45,7 +45,8 @@ class VectorEnv:
         return state.replace(info={**state.info, **bookkeeping, "next_obs": state.obs})
 
     def _step(self, state: State, action: jax.Array) -> State:
-        reached = self.env.step(state, action)
+        # `done` is ours by now: at an episode's end it says so, and an environment that never ends would keep it.
+        reached = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
         finite = jnp.array(True)
         for leaf in jax.tree.leaves((reached.obs, reached.reward)):
             finite &= jnp.isfinite(leaf).all()

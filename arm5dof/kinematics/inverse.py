@@ -77,7 +77,7 @@ def inverse(position: jax.Array, pitch: jax.Array | None = None, limits: jax.Arr
     theta5 = _into(theta5, lower[4], upper[4])
     theta = jnp.stack([theta1, theta12 - theta1, theta3, theta4, theta5], axis=-1)
 
-    valid = reaches
+    valid = reaches & jnp.isfinite(theta).all(-1)
     if limits is not None:
         valid &= jnp.all((theta >= lower - 4 * slack) & (theta <= upper + 4 * slack), axis=-1)
     return Solutions(jnp.where(reaches[..., None], theta, jnp.nan), valid)
