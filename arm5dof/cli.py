@@ -39,11 +39,11 @@ A CSV has a header with x, y and z. Exit status 2 if a target is not reached wit
 """
 
 SMOKE = {
-    "episodes": "40",
+    "episodes": "20",
     "num_envs": "20",
     "evaluate_every": "20",
     "checkpoint_every": "20",
-    "targets": "1000",
+    "targets": "500",
     "interim_targets": "500",
     "batch_size": "128",
     "width": "64",
