@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -343,8 +344,10 @@ def test_interrupt_is_no_traceback(tmp_path):
         str(tmp_path / "run"),
     ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
-    while not (tmp_path / "run" / "metrics.csv").exists():
+    metrics = tmp_path / "run" / "metrics.csv"
+    while not (metrics.exists() and metrics.stat().st_size):  # The first epoch is over, so nothing compiles any more.
         assert process.poll() is None
+        time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == 130 and "--resume" in err and "Traceback" not in err
