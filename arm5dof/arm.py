@@ -47,11 +47,13 @@ class Arm:
     """Where they stand in `qvel`, (dof,)."""
     actuators: np.ndarray
     """Ids of the joints' position actuators, (dof,); -1 where a joint has none."""
+    servo: np.ndarray
+    """Slope and offset of the control that holds a joint in a position, (dof, 2): gears and gains are not all 1."""
     site: int
     """Id of the end-effector site."""
     lower: np.ndarray
     upper: np.ndarray
-    """Joint limits, (dof,)."""
+    """Joint limits, (dof,), narrowed to what the position actuators can be told."""
     rest: np.ndarray
     """The model's `qpos0`, every coordinate of the scene, (nq,)."""
     chain: tuple[Link, ...]
@@ -113,6 +115,10 @@ class Arm:
         """Map actions in [-1, 1] to joint positions inside the limits; (..., dof) to (..., dof)."""
         return self.home + action * (self.upper - self.lower) / 2
 
+    def to_ctrl(self, q: jax.Array) -> jax.Array:
+        """What to tell the position actuators so that the joints come to rest at `q`; (..., dof) to (..., dof)."""
+        return self.servo[:, 0] * q + self.servo[:, 1]
+
     def to_action(self, q: jax.Array) -> jax.Array:
         """The inverse of `to_joints`."""
         return (q - self.home) * 2 / (self.upper - self.lower)
@@ -149,6 +155,9 @@ def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
         if not model.jnt_limited[j]:
             raise UserError(f'joint {name!r} has no limits: give it range="LOWER UPPER" in the MJCF')
 
+    actuators = np.array([_position_actuator(model, j) for j in ids])
+    servo = np.array([_servo(model, a) for a in actuators])
+    lower, upper = _limits(model, ids, actuators, servo)
     chain = _chain(model, path, site_id)
     slides = ids[model.jnt_type[ids] == SLIDE]
     zero = model.qpos0[model.jnt_qposadr[slides]]
@@ -159,10 +168,11 @@ def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
         joints=ids,
         qpos=model.jnt_qposadr[ids],
         dofs=model.jnt_dofadr[ids],
-        actuators=np.array([_position_actuator(model, j) for j in ids]),
+        actuators=actuators,
+        servo=servo,
         site=site_id,
-        lower=model.jnt_range[ids, 0].copy(),
-        upper=model.jnt_range[ids, 1].copy(),
+        lower=lower,
+        upper=upper,
         rest=model.qpos0.copy(),
         chain=chain,
         reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + travel.sum()),
@@ -231,14 +241,40 @@ def _position_actuator(model: mujoco.MjModel, joint: int) -> int:
         on_joint = model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and model.actuator_trnid[a, 0] == joint
         # A velocity servo has an affine bias too, but none that grows with position.
         affine = model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        if on_joint and affine and model.actuator_biasprm[a, 1]:
+        if on_joint and affine and model.actuator_biasprm[a, 1] and model.actuator_gainprm[a, 0]:
             return a
     return -1
 
 
+def _servo(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
+    """Slope and offset of the control at which gain * control + bias_0 + bias_1 * gear * q vanishes."""
+    if actuator < 0:
+        return 1.0, 0.0
+    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
+    return -bias[1] * model.actuator_gear[actuator, 0] / gain, -bias[0] / gain
+
+
+def _limits(
+    model: mujoco.MjModel, ids: np.ndarray, actuators: np.ndarray, servo: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The joints' ranges where their actuators' control ranges allow them. Raises `UserError` if nothing is left."""
+    lower, upper = model.jnt_range[ids].T.copy()
+    for k, a in enumerate(actuators):
+        if a >= 0 and model.actuator_ctrllimited[a]:
+            told = np.sort((model.actuator_ctrlrange[a] - servo[k, 1]) / servo[k, 0])
+            lower[k], upper[k] = max(lower[k], told[0]), min(upper[k], told[1])
+        if not lower[k] < upper[k]:
+            name = model.joint(ids[k]).name
+            raise UserError(f"joint {name!r} cannot move: its range and its actuator's ctrlrange leave nothing")
+    return lower, upper
+
+
 def _compile(source: str | Path | mujoco.MjSpec) -> mujoco.MjModel:
     if isinstance(source, mujoco.MjSpec):
-        return source.compile()
+        try:
+            return source.compile()
+        except ValueError as error:
+            raise UserError(f"MuJoCo cannot compile the model: {' '.join(str(error).split())}") from None
     path = files.find("mjcf", source)
     if path is None:
         known = ", ".join(files.shipped("mjcf", ".xml"))

@@ -179,6 +179,34 @@ def test_only_position_servos_count_as_actuators():
     np.testing.assert_array_equal(arm.actuators, [0, -1, -1, -1])
 
 
+def test_gears_gains_and_control_ranges_of_the_servos_are_respected():
+    """Told `to_ctrl(q)`, C MuJoCo's servos come to rest at q whatever their gear, gain and bias; and the limits are
+    those that the controls can ask for."""
+    spec = serial_arm(3, seed=4)
+    spec.option.gravity = [0, 0, 0]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for joint in spec.joints:
+        joint.armature = 1.0
+    plain = load(spec.copy())
+    servos = list(spec.actuators)
+    servos[1].gear[0] = -2.5
+    servos[1].ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    servos[2].gainprm[0], servos[2].biasprm[0] = 50.0, 10.0
+    middle = (plain.lower[2] + plain.upper[2]) / 2
+    servos[2].inheritrange, servos[2].ctrllimited = 0.0, mujoco.mjtLimited.mjLIMITED_TRUE
+    servos[2].ctrlrange = [2 * middle - 0.2 - 0.2, 2 * middle - 0.2 + 0.2]
+    arm = load(spec)
+    np.testing.assert_allclose(arm.lower, [*plain.lower[:2], middle - 0.1], atol=1e-9)
+    np.testing.assert_allclose(arm.upper, [*plain.upper[:2], middle + 0.1], atol=1e-9)
+
+    q = np.asarray(arm.sample(jax.random.key(5)), float)
+    data = mujoco.MjData(arm.mj_model)
+    place(arm, data, arm.home)
+    data.ctrl[arm.actuators] = arm.to_ctrl(q)
+    mujoco.mj_step(arm.mj_model, data, nstep=10_000)
+    np.testing.assert_allclose(data.qpos[arm.qpos], q, atol=1e-3)
+
+
 # Errors
 
 ARM = """<mujoco><worldbody><body name="a">{joint}<geom size=".1"/>
@@ -209,6 +237,20 @@ def test_bad_arms_are_refused_in_one_line(tmp_path: Path, xml: str, words: str):
         load(path)
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_an_arm_that_cannot_be_compiled_or_moved_is_refused_in_one_line():
+    spec = serial_arm(2, seed=0)
+    spec.joint("joint_0").range = [1, -1]
+    with pytest.raises(UserError, match="cannot compile") as refused:
+        load(spec)
+    assert "\n" not in str(refused.value)
+
+    spec = serial_arm(2, seed=0)
+    servo = next(iter(spec.actuators))
+    servo.inheritrange, servo.ctrllimited, servo.ctrlrange = 0.0, mujoco.mjtLimited.mjLIMITED_TRUE, [50, 51]
+    with pytest.raises(UserError, match="'joint_0' cannot move"):
+        load(spec)
 
 
 def test_the_same_arm_without_the_fault_is_accepted(tmp_path: Path):

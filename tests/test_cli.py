@@ -272,7 +272,7 @@ def test_a_damaged_checkpoint_is_one_line_and_left_as_it_is(trained, tmp_path, f
     assert digest(folder) == before
 
 
-def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails):
+def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails, monkeypatch):
     folder = copy(trained, tmp_path / "other")
     text = (folder / "config.toml").read_text()
     (folder / "config.toml").write_text(text.replace("width = 16", "width = 24"))
@@ -283,7 +283,10 @@ def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails):
     for item in newest(folder).iterdir():
         subprocess.run(["rm", "-r", str(item)], check=True)
     (newest(folder) / "model.pkl").write_bytes(b"cos\nsystem\n(S'touch owned'\ntR.")
+    monkeypatch.chdir(tmp_path)
     assert "checkpoint" in fails("eval", folder)
+    assert "checkpoint" in fails("train", "--resume", folder)
+    assert not list(tmp_path.rglob("owned")), "the planted pickle was executed"
 
     folder = tmp_path / "empty"
     folder.mkdir()

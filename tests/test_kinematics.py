@@ -274,6 +274,7 @@ def test_full_reach_is_reachable_in_float32():
         solutions = inverse(position)
         assert solutions.valid.all()
         assert np.abs(forward(solutions.theta).position - position[:, None]).max() < 1e-6
+        assert all(unreachable_because(p) is None for p in position[:20])
 
 
 @given(st.integers(0, 2), st.sampled_from([np.nan, np.inf, -np.inf]))

@@ -86,7 +86,7 @@ class Reach:
         target = self.arm.to_joints(jnp.clip(action, -1, 1))
         data, goal = state.data, state.info["goal"]
         if self.config.dynamics == "servo":
-            data = data.replace(ctrl=data.ctrl.at[self.arm.actuators].set(target))
+            data = data.replace(ctrl=data.ctrl.at[self.arm.actuators].set(self.arm.to_ctrl(target)))
             data = jax.lax.fori_loop(0, self.config.substeps, lambda _, d: mjx.step(self.arm.mjx_model, d), data)
         else:
             data = data.replace(qpos=data.qpos.at[self.arm.qpos].set(target))

@@ -85,16 +85,17 @@ def inverse(position: jax.Array, pitch: jax.Array | None = None, limits: jax.Arr
 
 def unreachable_because(position: jax.Array) -> str | None:
     """Why the arm, its joints unlimited, cannot reach one position (3,); None where it can."""
+    position = jnp.asarray(position)
+    if not jnp.isfinite(position).all():
+        return "the position is not finite"
+    if inverse(position).valid.any():
+        return None
     x, y, z = (float(v) for v in position)
     radius, height = (x * x + y * y) ** 0.5, z - D1
-    if not all(map(jnp.isfinite, (x, y, z))):
-        return "the position is not finite"
     if radius < D5:
         return f"it is {radius * 1e3:.1f} mm from the vertical axis, inside the hole of {D5 * 1e3:.0f} mm round it"
     distance = max(radius**2 - D5**2 + height**2, 0.0) ** 0.5
-    if not INNER <= distance <= OUTER:
-        return f"it is {distance * 1e3:.1f} mm from the shoulder, outside {INNER * 1e3:.0f} to {OUTER * 1e3:.0f} mm"
-    return None
+    return f"it is {distance * 1e3:.1f} mm from the shoulder, outside {INNER * 1e3:.0f} to {OUTER * 1e3:.0f} mm"
 
 
 def _into(angle: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
