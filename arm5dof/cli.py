@@ -45,8 +45,6 @@ SMOKE = {
     "checkpoint_every": "20",
     "targets": "500",
     "interim_targets": "500",
-    "batch_size": "128",
-    "width": "64",
 }
 """What `--smoke` sets, unless the command line sets it otherwise."""
 

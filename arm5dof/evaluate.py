@@ -5,14 +5,15 @@ numbers that training never touches. Three questions are asked of the same targe
 
 - `one_shot`: how far from the target does one answer of the policy put the end effector, by forward kinematics?
 - `refined`: the same, the policy asked again with the target shifted by the error it made (`Policy.__call__`);
-- `episode`: how far is the end effector at the last step of an episode from a random pose, in the environment?
+- `episode`: how far is the end effector at the last step of an episode from a random pose, in the environment? The
+  policy is asked again here too, in the first steps, with the target shifted by the error that the arm then shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ class EvaluateConfig:
     interim_targets: Annotated[int, Ge(1)] = static(default=2_000)
     """Targets in the evaluations on the way."""
     refinements: Annotated[int, Ge(0)] = static(default=3)
-    """How often the policy is asked again for the `refined` figure."""
+    """How often the policy is asked again for the `refined` and the `episode` figure."""
 
 
 Accuracy = dict[str, Any]
@@ -90,6 +91,15 @@ def table(results: dict[str, Accuracy]) -> str:
     return "\n".join(lines)
 
 
+class Asking(NamedTuple):
+    """Episodes under way: the target to ask for next, the one that led closest so far, and how close, metres."""
+
+    state: State
+    asked: jax.Array
+    best: jax.Array
+    error: jax.Array
+
+
 @partial(jax.jit, static_argnames=("env", "agent", "count", "refinements"))
 def _measure(
     env: Reach, agent: DDPG, config: DDPGConfig, networks: Networks, key: jax.Array, count: int, refinements: int
@@ -98,13 +108,24 @@ def _measure(
     goals = jax.vmap(env.sample_goal)(jax.random.split(goal_key, count))
     state = jax.vmap(env.start)(env.arm.sample(pose_key, (count,)), goals)
     start = state.metrics["distance"]
+    head = agent.head(config, networks.actor, networks.critic, state.obs)
 
-    def step(state: State, _: None) -> tuple[State, None]:
-        action = agent.act(config, networks.actor, networks.critic, state.obs)[0]
-        return jax.vmap(env.step)(state, action), None
+    def step(asking: Asking, again: jax.Array) -> tuple[Asking, None]:
+        asked = jnp.where(again, asking.asked, asking.best)
+        obs = jax.vmap(env.relabel)(asking.state.obs, asked)
+        state = jax.vmap(env.step)(asking.state, agent.answer(networks.actor, obs, head))
+        error = state.metrics["distance"]
+        better = again & (error < asking.error)
+        return Asking(
+            state=state,
+            asked=asked + goals - jax.vmap(env.achieved)(state.obs),
+            best=jnp.where(better[:, None], asked, asking.best),
+            error=jnp.where(better, error, asking.error),
+        ), None
 
-    final, _ = jax.lax.scan(step, state, None, env.config.episode_length)
-    last = final.metrics["distance"]
+    again = jnp.arange(env.config.episode_length) <= refinements
+    final, _ = jax.lax.scan(step, Asking(state, goals, goals, jnp.full(count, jnp.inf)), again)
+    last = final.state.metrics["distance"]
     policy = Policy(env, agent, config, networks)
     return {
         "one_shot": policy(goals).error,

@@ -52,13 +52,10 @@ def _answer(env: Reach, agent: DDPG, config: DDPGConfig, networks: Networks, tar
     seen = env.start(jnp.asarray(env.arm.home, jnp.float32), targets[0]).obs
     observe = jax.vmap(partial(env.relabel, seen))
 
-    def candidates(points: jax.Array) -> jax.Array:
-        return agent.candidates(networks.actor, observe(points))
-
-    head = agent.value(config, networks.critic, observe(targets), candidates(targets)).argmax(-1)
+    head = agent.head(config, networks.actor, networks.critic, observe(targets))
 
     def ask(points: jax.Array) -> Answer:
-        q = env.arm.to_joints(jnp.take_along_axis(candidates(points), head[:, None, None], 1)[:, 0])
+        q = env.arm.to_joints(agent.answer(networks.actor, observe(points), head))
         position = env.arm.forward(q)
         return Answer(q, position, jnp.linalg.norm(position - targets, axis=-1))
 

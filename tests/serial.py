@@ -1,4 +1,4 @@
-"""Arms that are not the paper's: random serial ones, and one with seven joints."""
+"""Random serial arms."""
 
 from __future__ import annotations
 
@@ -62,51 +62,3 @@ def _finger(body: mujoco.MjsBody, name: str) -> None:
 def _unit(rng: np.random.Generator, size: int) -> np.ndarray:
     vector = rng.normal(size=size)
     return vector / np.linalg.norm(vector)
-
-
-SEVEN_DOF = """
-<mujoco model="seven_dof">
-  <compiler angle="degree" autolimits="true"/>
-  <option timestep="0.02" integrator="implicitfast">
-    <flag constraint="disable"/>
-  </option>
-  <default>
-    <joint armature="0.05"/>
-    <position kp="10000" kv="200" inheritrange="1"/>
-    <geom type="capsule" size="0.025" contype="0" conaffinity="0"/>
-  </default>
-  <worldbody>
-    <body name="shoulder" pos="0 0 0.15" gravcomp="1">
-      <joint name="shoulder_yaw" axis="0 0 1" range="-150 150"/>
-      <joint name="shoulder_pitch" axis="0 1 0" range="-30 120"/>
-      <joint name="shoulder_roll" axis="0 0 1" range="-120 120"/>
-      <geom name="upper_arm" fromto="0 0 0 0 0 0.26" mass="0.8"/>
-      <body name="elbow" pos="0 0 0.26" gravcomp="1">
-        <joint name="elbow" axis="0 1 0" range="0 140"/>
-        <geom name="forearm" fromto="0 0 0 0 0 0.23" mass="0.5"/>
-        <body name="wrist" pos="0 0 0.23" gravcomp="1">
-          <joint name="wrist_roll" axis="0 0 1" range="-120 120"/>
-          <joint name="wrist_pitch" axis="0 1 0" range="-70 70"/>
-          <joint name="wrist_yaw" axis="1 0 0" range="-70 70"/>
-          <geom name="hand" fromto="0 0 0 0 0 0.08" mass="0.2"/>
-          <site name="ee" pos="0 0 0.11"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position joint="shoulder_yaw"/>
-    <position joint="shoulder_pitch"/>
-    <position joint="shoulder_roll"/>
-    <position joint="elbow"/>
-    <position joint="wrist_roll"/>
-    <position joint="wrist_pitch"/>
-    <position joint="wrist_yaw"/>
-  </actuator>
-</mujoco>
-"""
-
-
-def seven_dof() -> mujoco.MjSpec:
-    """An anthropomorphic arm that reaches 0.6 m: a spherical shoulder, an elbow, a spherical wrist."""
-    return mujoco.MjSpec.from_string(SEVEN_DOF)

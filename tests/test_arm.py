@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from serial import serial_arm, seven_dof
+from serial import serial_arm
 
 from arm5dof import files
 from arm5dof.arm import Arm, load
@@ -260,7 +260,7 @@ def test_the_same_arm_without_the_fault_is_accepted(tmp_path: Path):
 
 
 def test_a_missing_file_names_those_there_are(tmp_path: Path):
-    with pytest.raises(UserError, match=r"no MJCF file 'absent\.xml'.*arm5\.xml, reach\.xml"):
+    with pytest.raises(UserError, match=r"no MJCF file 'absent\.xml'.*arm5\.xml, arm7\.xml, reach\.xml"):
         load("absent.xml")
     with pytest.raises(UserError, match="no MJCF file"):
         load(tmp_path)
@@ -300,10 +300,10 @@ def test_fifty_grams_in_the_gripper_bend_it_by_less_than_a_tenth_of_a_millimetre
     assert max(sunk) > 1e-5
 
 
-@pytest.mark.parametrize("which", ["arm5", "seven_dof"])
+@pytest.mark.parametrize("which", ["arm5", "arm7"])
 def test_a_control_step_settles_to_one_percent(arm: Arm, which: str):
     """From 400 random poses to 400 others: the error left is below 1 % of the largest joint's move."""
-    arm = arm if which == "arm5" else load(seven_dof())
+    arm = arm if which == "arm5" else load("arm7.xml")
     data = mujoco.MjData(arm.mj_model)
     for start, target in zip(random_poses(arm, 400, 1), random_poses(arm, 400, 2), strict=True):
         place(arm, data, start)

@@ -22,7 +22,7 @@ from arm5dof.run import Run, free_folder, make_trainer
 
 TINY = (
     "kinematic.toml --episodes 4 --num-envs 2 --evaluate-every 2 --checkpoint-every 2 --episode-length 32 "
-    "--batch-size 32 --width 16 --heads 2 --updates-per-step 2 --targets 100 --interim-targets 100 "
+    "--batch-size 32 --actor-width 16 --heads 2 --updates-per-step 2 --targets 100 --interim-targets 100 "
     "--replay-capacity 1024"
 )
 
@@ -275,7 +275,7 @@ def test_a_damaged_checkpoint_is_one_line_and_left_as_it_is(trained, tmp_path, f
 def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails, monkeypatch):
     folder = copy(trained, tmp_path / "other")
     text = (folder / "config.toml").read_text()
-    (folder / "config.toml").write_text(text.replace("width = 16", "width = 24"))
+    (folder / "config.toml").write_text(text.replace("actor_width = 16", "actor_width = 24"))
     assert "does not fit the run's config.toml" in fails("eval", folder)
     assert "does not fit the run's config.toml" in fails("train", "--resume", folder)
 

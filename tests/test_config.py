@@ -103,7 +103,7 @@ def test_numbers_are_traced_and_sizes_are_not():
     traced = [f.name for f in dataclasses.fields(DDPGConfig) if not f.metadata.get("static")]
     assert len(leaves) == len(traced)
     assert {"actor_lr", "critic_lr", "discount", "tau", "noise"} <= set(traced)
-    assert not {"batch_size", "width", "heads"} & set(traced)
+    assert not {"batch_size", "actor_width", "heads"} & set(traced)
     changed = jax.tree.map(lambda x: 2 * x, DDPGConfig())
     assert changed.actor_lr == 2 * DDPGConfig().actor_lr and changed.batch_size == DDPGConfig().batch_size
 

@@ -10,24 +10,28 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from environments import Bandit, Loan, Salary, Toy, Walk
 from hypothesis import given
 from hypothesis import strategies as st
-from serial import seven_dof
 
 from arm5dof.arm import load
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks, Replay, Training, Transition, losses
+from arm5dof.ddpg.networks import Critic
 from arm5dof.envs import Reach, ReachConfig
 from arm5dof.errors import UserError
 
 SMALL = DDPGConfig(
     heads=1,
     critic_view="state",
+    critic_form="scalar",
+    random=0.0,
     batch_size=64,
     updates_per_step=8,
-    width=32,
-    depth=2,
+    actor_width=32,
+    actor_depth=2,
+    critic_width=32,
     replay_capacity=4096,
     noise=0.5,
     final_noise=0.5,
@@ -144,7 +148,7 @@ def test_training_does_not_copy_the_replay_buffer():
     """Within an epoch's loop too: what it needs beside its state does not grow with the buffer."""
     temporary = []
     for capacity in (1 << 10, 1 << 18):
-        config = replace(SMALL, replay_capacity=capacity, updates_per_step=1, depth=1)
+        config = replace(SMALL, replay_capacity=capacity, updates_per_step=1, actor_depth=1)
         agent = DDPG(Walk(), config, num_envs=16, episode_length=20, total_steps=100)
         training = jax.eval_shape(agent.init, config, jax.random.key(0))
         epoch = jax.jit(partial(agent.epoch, steps=10), donate_argnums=1).lower(config, training).compile()
@@ -221,7 +225,8 @@ class Bench(NamedTuple):
 
 @pytest.fixture(scope="module", params=[1, 3], ids=["one head", "three heads"])
 def bench(request: pytest.FixtureRequest) -> Bench:
-    config = replace(SMALL, heads=request.param, width=8, discount=0.9, tau=0.3, temperature=0.5, final_lr=1.0)
+    changes = {"discount": 0.9, "tau": 0.3, "temperature": 0.5, "final_lr": 1.0}
+    config = replace(SMALL, heads=request.param, actor_width=8, critic_width=8, **changes)
     agent = DDPG(Probe(), config, num_envs=1, episode_length=10, total_steps=100)
     training = jax.jit(agent.init)(config, jax.random.key(0))
     keys = iter(jax.random.split(jax.random.key(1), 1000))
@@ -374,6 +379,48 @@ def test_discount_0_never_looks_ahead(bench: Bench):
 def test_a_view_the_environment_cannot_give_is_refused():
     with pytest.raises(UserError, match="--critic-view state"):
         DDPG(Walk(), replace(SMALL, critic_view="outcome"), num_envs=1, episode_length=10, total_steps=100)
+    with pytest.raises(UserError, match="--critic-form scalar"):
+        DDPG(Walk(), replace(SMALL, critic_form="distance"), num_envs=1, episode_length=10, total_steps=100)
+
+
+def test_a_distance_critic_keeps_the_tip_of_a_distance():
+    """Regression on -|x - y| in the plane: never positive, and near the tip, which a plain network of the same size
+    rounds off, several times closer to it."""
+    far, y = jax.random.normal(jax.random.key(0), (2, 512, 2))
+    x = jnp.where(jnp.arange(512)[:, None] % 2, far, y + 0.1 * far)
+    near = y + 0.02 * jax.random.normal(jax.random.key(1), y.shape)
+
+    def errors(critic: Critic, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        q = jnp.asarray(critic.apply(params, jnp.concatenate([x, y], -1)))
+        return q, q + jnp.linalg.norm(x - y, axis=-1)
+
+    @partial(jax.jit, static_argnums=0)
+    def fitted(critic: Critic) -> Any:
+        adam = optax.adam(optax.cosine_decay_schedule(1e-2, 1000))
+
+        def step(carry: Any, _: None) -> tuple[Any, None]:
+            params, state = carry
+            gradient = jax.grad(lambda p: (errors(critic, p, x)[1] ** 2).mean())(params)
+            updates, state = adam.update(gradient, state)
+            return (optax.apply_updates(params, updates), state), None
+
+        params = critic.init(jax.random.key(2), jnp.zeros(4))
+        return jax.lax.scan(step, (params, adam.init(params)), None, 1000)[0][0]
+
+    distance, scalar = (
+        Critic(form, width=32, depth=2, activation="gelu", layer_norm=False) for form in ("distance", "scalar")
+    )
+    q, error = errors(distance, fitted(distance), near)
+    assert (q <= 0).all()
+    rounded = jnp.abs(errors(scalar, fitted(scalar), near)[1]).mean()
+    assert jnp.abs(error).mean() < min(0.02, rounded / 3)
+
+
+def test_a_distance_critic_has_a_gradient_at_the_goal():
+    """A length has none there; NaN would poison the actor."""
+    critic = Critic("distance", width=8, depth=1, activation="gelu", layer_norm=False)
+    params = jax.tree.map(jnp.zeros_like, critic.init(jax.random.key(0), jnp.zeros(3)))
+    assert_finite(jax.grad(lambda p, v: critic.apply(p, v), argnums=(0, 1))(params, jnp.ones(3)))
 
 
 # Collecting
@@ -391,6 +438,21 @@ def test_noise_falls_linearly(steps: int, noise: float):
     assert np.std(deviation) == pytest.approx(noise, rel=0.03)
     assert abs(np.mean(deviation)) < 0.02
     assert after.steps == steps + 1
+
+
+@pytest.mark.parametrize(("steps", "share"), [(0, 0.8), (50, 0.4), (100, 0.0), (150, 0.0)])
+def test_random_actions_become_rare(steps: int, share: float):
+    """Without noise an action is the policy's, or it is uniform."""
+    config = replace(SMALL, noise=0.0, final_noise=0.0, random=0.8, replay_capacity=8192)
+    agent = DDPG(Walk(), config, num_envs=8192, episode_length=10, total_steps=100)
+    training = agent.init(config, jax.random.key(0)).replace(steps=jnp.int32(steps))
+    action = np.asarray(agent.collect(config, training)[0].replay.storage.action)
+    drawn = action[(action != agent.candidates(training.networks.actor, training.env.obs)[:, 0]).any(-1)]
+    assert len(drawn) / len(action) == pytest.approx(share, abs=0.03)
+    if share:
+        counts, _ = np.histogram(drawn, 10, (-1, 1))
+        assert counts.sum() == drawn.size
+        assert np.abs(counts - drawn.size / 10).max() < 6 * np.sqrt(drawn.size / 10)
 
 
 def test_noisy_actions_stay_in_bounds():
@@ -588,7 +650,7 @@ class Learnt(NamedTuple):
 
 
 def learn(env: Reach, seeds: int, steps: int) -> Learnt:
-    config = DDPGConfig(batch_size=128, updates_per_step=16, width=64, depth=2, replay_capacity=4096)
+    config = DDPGConfig(batch_size=128, updates_per_step=16, actor_width=64, actor_depth=2, replay_capacity=4096)
     agent = DDPG(env, config, num_envs=32, episode_length=20, total_steps=steps)
     keys = jax.random.split(jax.random.key(0), seeds)
     # One seed after another: networks this small gain nothing from `vmap` on a CPU, and it takes longer to compile.
@@ -610,7 +672,7 @@ def test_the_papers_arm_learns(paper_arm: Learnt):
 
 
 def test_seven_joints_learn_with_the_same_code():
-    run = learn(Reach(load(seven_dof()), ReachConfig(dynamics="kinematic")), seeds=2, steps=80)
+    run = learn(Reach(load("arm7.xml"), ReachConfig(dynamics="kinematic")), seeds=2, steps=80)
     before, after = run.median(run.before), run.median(run.after)
     assert before.min() > 0.2
     assert (after < before / 4).all(), (before, after)

@@ -33,7 +33,13 @@ def test_models_and_experiments_are_found_from_an_installed_wheel(wheel, tmp_pat
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == [str(tmp_path / "site" / "arm5dof" / "__init__.py"), "5", "arm5.xml", "reach.xml"]
+    assert done.stdout.split() == [
+        str(tmp_path / "site" / "arm5dof" / "__init__.py"),
+        "5",
+        "arm5.xml",
+        "arm7.xml",
+        "reach.xml",
+    ]
 
 
 def test_wheel_carries_no_test_data(wheel):

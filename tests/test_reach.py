@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from serial import serial_arm, seven_dof
+from serial import serial_arm
 
 from arm5dof.arm import Arm, load
 from arm5dof.envs import GoalEnv, Reach, ReachConfig, State
@@ -311,7 +311,7 @@ def test_an_arm_without_servos_can_only_be_posed():
 
 
 def test_seven_joints_without_a_marker():
-    arm = load(seven_dof())
+    arm = load("arm7.xml")
     env = Reach(arm, ReachConfig(dynamics="kinematic", observation="full"))
     state = reset(env)(jax.random.split(jax.random.key(0), 8))
     assert state.obs["state"].shape == (8, 6 * 7 + 2 * 7 + 6)

@@ -13,7 +13,7 @@ from arm5dof.checkpoint import Checkpoints
 from arm5dof.run import Run, make_trainer
 
 SETTINGS = (
-    "--episodes 24 --num-envs 4 --evaluate-every 12 --checkpoint-every 4 --batch-size 64 --width 32 --heads 2 "
+    "--episodes 24 --num-envs 4 --evaluate-every 12 --checkpoint-every 4 --batch-size 64 --actor-width 32 --heads 2 "
     "--updates-per-step 4 --targets 100 --interim-targets 100 --replay-capacity 8192 --seed 5"
 )
 KILLS = 5

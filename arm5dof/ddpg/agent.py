@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import optax
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Gt, Le, Lt
 from flax import struct
 
 from arm5dof.ddpg import losses
@@ -39,6 +39,8 @@ class DDPGConfig:
     """Adam's step size for the critic at the start of training."""
     final_lr: Unit = 0.0
     """Share of both step sizes that is left at the end; they follow a cosine."""
+    adam_b2: Annotated[float, Ge(0), Lt(1)] = 0.99
+    """How long Adam remembers the size of gradients. It shrinks as the networks learn: the usual 0.999 is slow."""
     discount: Unit = 0.0
     """gamma in Eq. 4. With absolute joint targets an answer is judged at once, so 0 is enough."""
     tau: Unit = 0.01
@@ -47,6 +49,9 @@ class DDPGConfig:
     """Standard deviation of the normal exploration noise at the start, in units of half a joint's range."""
     final_noise: Annotated[float, Ge(0)] = 0.05
     """The same at the end of training; it falls linearly."""
+    random: Unit = 1.0
+    """Share of actions that are drawn uniformly at random at the start of training; it falls linearly to none. What
+    they reach covers the workspace, and hindsight makes goals of it."""
     relabel: Unit = 0.8
     """Share of sampled transitions whose goal is exchanged in hindsight for a point reached in another one."""
     temperature: Positive = 0.01
@@ -56,14 +61,20 @@ class DDPGConfig:
     critic_view: Literal["outcome", "state"] = static(default="outcome")
     """outcome: the critic sees where the action leads by the arm's forward model, as the paper's does; state: it
     sees the observation and the action."""
-    batch_size: Count = static(default=256)
+    critic_form: Literal["distance", "scalar"] = static(default="distance")
+    """distance: Q is minus a learnt distance, for rewards that are minus a distance; scalar: Q is any number."""
+    batch_size: Count = static(default=64)
     """Transitions in an update."""
-    updates_per_step: Count = static(default=16)
+    updates_per_step: Count = static(default=64)
     """Updates after each step of all environments."""
-    width: Count = static(default=128)
-    """Units in a hidden layer."""
-    depth: Count = static(default=3)
-    """Hidden layers."""
+    actor_width: Count = static(default=128)
+    """Units in a hidden layer of the actor."""
+    actor_depth: Count = static(default=3)
+    """The actor's hidden layers."""
+    critic_width: Count = static(default=32)
+    """Units in a hidden layer of the critic."""
+    critic_depth: Count = static(default=2)
+    """The critic's hidden layers."""
     activation: Literal["relu", "gelu", "tanh"] = static(default="gelu")
     """Of the hidden layers."""
     layer_norm: bool = static(default=False)
@@ -107,13 +118,14 @@ class DDPG:
         self.goal_env: GoalEnv | None = env if isinstance(env, GoalEnv) else None
         if config.critic_view == "outcome" and self.goal_env is None:
             raise UserError("this environment foresees no outcome of an action: train with --critic-view state")
+        if config.critic_form == "distance" and self.goal_env is None:
+            raise UserError("this environment's rewards may be no distances: train with --critic-form scalar")
         self.vector = VectorEnv(env, episode_length)
         self.num_envs = num_envs
         self.total_steps = total_steps
-        shape = {k: getattr(config, k) for k in ("width", "depth", "activation", "layer_norm")}
-        self.actor = Actor(action_size=env.action_size, heads=config.heads, **shape)
-        self.critic = Critic(**shape)
-        self.adam = optax.scale_by_adam()
+        style = (config.activation, config.layer_norm)
+        self.actor = Actor(env.action_size, config.heads, config.actor_width, config.actor_depth, *style)
+        self.critic = Critic(config.critic_form, config.critic_width, config.critic_depth, *style)
 
     def init(self, config: DDPGConfig, key: jax.Array) -> Training:
         """Random networks, target networks equal to them, an empty replay buffer, environments at their start."""
@@ -129,8 +141,8 @@ class DDPG:
         count = jnp.zeros((), jnp.int32)
         return Training(
             networks=Networks(actor, critic, actor, critic),
-            actor_optimiser=self.adam.init(actor),
-            critic_optimiser=self.adam.init(critic),
+            actor_optimiser=optax.scale_by_adam().init(actor),
+            critic_optimiser=optax.scale_by_adam().init(critic),
             replay=Replay.create(example, capacity),
             env=env,
             key=key,
@@ -161,6 +173,14 @@ class DDPG:
         best = q.argmax(-1)
         return _pick(actions, best), _pick(q, best)
 
+    def head(self, config: DDPGConfig, actor: Params, critic: Params, obs: Observation) -> jax.Array:
+        """Which of the actor's heads the critic prefers for a batch of observations, (batch,) int32."""
+        return self.value(config, critic, obs, self.candidates(actor, obs)).argmax(-1)
+
+    def answer(self, actor: Params, obs: Observation, head: jax.Array) -> jax.Array:
+        """The actions of given heads (batch,) for a batch of observations, (batch, action_size)."""
+        return _pick(self.candidates(actor, obs), head)
+
     def epoch(self, config: DDPGConfig, training: Training, steps: int) -> tuple[Training, Metrics]:
         """Lines 6 to 15 of Algorithm 1, `steps` times: act, store, learn. Returns the metrics' means."""
 
@@ -177,11 +197,13 @@ class DDPG:
 
     def collect(self, config: DDPGConfig, training: Training) -> tuple[Training, Metrics]:
         """Lines 7 to 9: every environment acts with noise, and the replay buffer stores what came of it."""
-        key, noise_key = jax.random.split(training.key)
-        networks, obs = training.networks, training.env.obs
-        noise = config.noise + (config.final_noise - config.noise) * self._progress(training)
+        key, noise_key, random_key, which_key = jax.random.split(training.key, 4)
+        networks, obs, progress = training.networks, training.env.obs, self._progress(training)
+        noise = config.noise + (config.final_noise - config.noise) * progress
         action, _ = self.act(config, networks.actor, networks.critic, obs)
         action = jnp.clip(action + noise * jax.random.normal(noise_key, action.shape), -1, 1)
+        random = jax.random.bernoulli(which_key, config.random * (1 - progress), (self.num_envs, 1))
+        action = jnp.where(random, jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0), action)
         env = self.vector.step(training.env, action)
         transition = Transition(
             obs=obs,
@@ -249,12 +271,11 @@ class DDPG:
 
         rate = config.final_lr + (1 - config.final_lr) * (1 + jnp.cos(jnp.pi * self._progress(training))) / 2
         (loss, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(networks.critic)
-        critic, critic_optimiser = self._descend(
-            networks.critic, gradient, training.critic_optimiser, rate * config.critic_lr
-        )
-        actor, actor_optimiser = self._descend(
-            networks.actor, jax.grad(actor_loss)(networks.actor), training.actor_optimiser, rate * config.actor_lr
-        )
+        adam = optax.scale_by_adam(b2=config.adam_b2)
+        step, critic_optimiser = adam.update(gradient, training.critic_optimiser)
+        critic = optax.tree.add_scale(networks.critic, -rate * config.critic_lr, step)
+        step, actor_optimiser = adam.update(jax.grad(actor_loss)(networks.actor), training.actor_optimiser)
+        actor = optax.tree.add_scale(networks.actor, -rate * config.actor_lr, step)
         networks = Networks(
             actor=actor,
             critic=critic,
@@ -273,12 +294,6 @@ class DDPG:
         """gamma Q'(s', mu'(s')), nothing beyond a terminal state."""
         _, q = self.act(config, networks.target_actor, networks.target_critic, batch.next_obs)
         return config.discount * (1 - batch.terminal) * q
-
-    def _descend(
-        self, params: Params, gradient: Params, state: optax.OptState, rate: jax.Array
-    ) -> tuple[Params, optax.OptState]:
-        direction, state = self.adam.update(gradient, state)
-        return jax.tree.map(lambda p, d: p - rate * d, params, direction), state
 
     def _progress(self, training: Training) -> jax.Array:
         return jnp.minimum(training.steps / self.total_steps, 1.0)

@@ -8,6 +8,9 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+EMBEDDING = 16
+"""Dimensions of the space in which a critic of the form "distance" measures."""
+
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh}
 
 
@@ -53,8 +56,13 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """Q(s, a): the critic's view of an observation and an action, (..., view), to values (...)."""
+    """Q(s, a): the critic's view of an observation and an action, (..., view), to values (...).
 
+    In the form "distance" Q = -|MLP(view)|, the length of a learnt vector: where rewards are minus a distance (Eq. 7),
+    values have a tip at the goal that a smooth network rounds off. "scalar" is a plain network with one output.
+    """
+
+    form: str
     width: int
     depth: int
     activation: str
@@ -62,4 +70,8 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, view: jax.Array) -> jax.Array:
-        return MLP(self.width, self.depth, 1, self.activation, self.layer_norm)(view)[..., 0]
+        size = EMBEDDING if self.form == "distance" else 1
+        out = MLP(self.width, self.depth, size, self.activation, self.layer_norm)(view)
+        if self.form == "scalar":
+            return out[..., 0]
+        return -jnp.sqrt((out**2).sum(-1) + 1e-12)

@@ -1,0 +1,120 @@
+"""How quickly the policy learns: every budget, and what each ingredient of the recipe is worth.
+
+    python experiments/learning.py budgets                    five seeds of each row, into experiments/results/
+    python experiments/learning.py ablations --seeds 3
+    python experiments/learning.py budgets --rows 25 --seeds 1   only rows with "25" in their name; nothing is written
+
+All rows are judged on 10,000 unseen targets at the end of training. Runs are left in runs/learning/ and resumed if they
+are there already.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import re
+from pathlib import Path
+
+import numpy as np
+
+from arm5dof import config, files, run, xla
+
+RESULTS = Path(__file__).parent / "results"
+
+STATE = "--critic-view state --critic-width 128 --critic-depth 3"
+"""A critic that sees joint angles and action, and has to learn the arm's kinematics itself."""
+
+BUDGETS = {
+    "25 episodes, kinematic": "kinematic.toml --episodes 25 --num-envs 25",
+    "100 episodes, kinematic": "kinematic.toml --episodes 100",
+    "400 episodes, kinematic": "kinematic.toml",
+    "100 episodes, servo": "reach.toml --episodes 100",
+    "400 episodes, servo": "reach.toml",
+    "25 episodes, kinematic, state critic": f"kinematic.toml --episodes 25 --num-envs 25 {STATE}",
+    "100 episodes, kinematic, state critic": f"kinematic.toml --episodes 100 {STATE}",
+    "400 episodes, kinematic, state critic": f"kinematic.toml {STATE}",
+    "400 episodes, kinematic, seven joints": "kinematic.toml --arm arm7.xml",
+}
+
+BASE = "kinematic.toml --episodes 100"
+ABLATIONS = {
+    "the recipe": BASE,
+    "no random actions": f"{BASE} --random 0",
+    "no relabelling in hindsight": f"{BASE} --relabel 0",
+    "all goals relabelled": f"{BASE} --relabel 1",
+    "scalar critic": f"{BASE} --critic-form scalar",
+    "scalar critic of width 128, depth 3": f"{BASE} --critic-form scalar --critic-width 128 --critic-depth 3",
+    "state critic": f"{BASE} {STATE}",
+    "one head": f"{BASE} --heads 1",
+    "two heads": f"{BASE} --heads 2",
+    "eight heads": f"{BASE} --heads 8",
+    "constant step size": f"{BASE} --final-lr 1",
+    "Adam's usual memory of 0.999": f"{BASE} --adam-b2 0.999",
+    "batch 256": f"{BASE} --batch-size 256",
+    "a quarter of the updates, batch 256": f"{BASE} --batch-size 256 --updates-per-step 16",
+    "actor of width 64": f"{BASE} --actor-width 64",
+    "actor of width 256": f"{BASE} --actor-width 256",
+    "layer norm": f"{BASE} --layer-norm true",
+    "relu": f"{BASE} --activation relu",
+    "constant noise of 0.5": f"{BASE} --final-noise 0.5",
+    "no noise": f"{BASE} --noise 0 --final-noise 0",
+    "the paper's observations": f"{BASE} --observation paper",
+}
+
+TABLES = {"budgets": BUDGETS, "ablations": ABLATIONS}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--rows", default="", help="only rows with this in their name; the table is not written")
+    arguments = parser.parse_args()
+    xla.enable_compilation_cache()
+    rows = {name: line for name, line in TABLES[arguments.table].items() if arguments.rows in name}
+    found = {name: [train(name, line, seed) for seed in range(arguments.seeds)] for name, line in rows.items()}
+    text = markdown(arguments.table, found, arguments.seeds)
+    print(text)
+    if not arguments.rows:
+        files.write_text(RESULTS / f"learning_{arguments.table}.json", json.dumps(found, indent=1) + "\n")
+        files.write_text(RESULTS / f"learning_{arguments.table}.md", text)
+
+
+def train(name: str, line: str, seed: int) -> dict:
+    """The last evaluation of one run, trained now or before. `line` is what `arm5dof train` would be given."""
+    experiment, *options = line.split()
+    overrides = {option[2:]: value for option, value in zip(options[::2], options[1::2], strict=True)}
+    episodes = overrides.get("episodes", "400")
+    settings = config.load(experiment, {**overrides, "seed": str(seed), "evaluate-every": episodes})
+    folder = Path("runs") / "learning" / re.sub(r"\W+", "-", f"{name}-{seed}")
+    opened = run.Run.open(folder) if folder.exists() else run.Run.create(settings, folder)
+    if opened.config != settings:
+        raise SystemExit(f"{folder} is of another version of this experiment: move it away")
+    return run.train(opened)[-1]
+
+
+def markdown(title: str, found: dict[str, list[dict]], seeds: int) -> str:
+    """Each row's worst and mean share of targets within a distance, and its mean median, over seeds."""
+    lines = [
+        f"# Learning: {title}, {seeds} seeds, 10,000 unseen targets",
+        "",
+        f"Command: `python experiments/learning.py {title} --seeds {seeds}`. {platform.machine()} CPU.",
+        "Shares are the mean over seeds; in brackets the worst seed.",
+        "",
+        "| | transitions | updates | | median | <= 1 mm | <= 5 mm | <= 10 mm |",
+        "| --- | ---: | ---: | --- |" + " ---: |" * 4,
+    ]
+    for name, evaluations in found.items():
+        first = evaluations[0]
+        for kind in ("one_shot", "refined", "episode"):
+            label = f"{name} | {first['env_steps']} | {first['updates']}" if kind == "one_shot" else " | | "
+            median = np.mean([e[kind]["median_mm"] for e in evaluations])
+            shares = [np.array([e[kind]["within"][limit] for e in evaluations]) for limit in ("1", "5", "10")]
+            cells = " | ".join(f"{share.mean():.2f} % ({share.min():.2f})" for share in shares)
+            lines.append(f"| {label} | {kind} | {median:.2f} mm | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()
