@@ -196,7 +196,7 @@ def _parser() -> Parser:
     p.add_argument("--target", type=float, nargs=3, action="append", metavar=("X", "Y", "Z"), help="metres; repeatable")
     p.add_argument("--csv", type=Path, metavar="IN.csv", help="many targets")
     p.add_argument("--out", type=Path, metavar="OUT.csv", help="with --csv: where the answers go; default: printed")
-    p.add_argument("--refine", type=_natural, default=3, metavar="N", help="ask again N times; default 3")
+    p.add_argument("--refine", type=_natural, default=10, metavar="N", help="ask again N times; default 10")
     p.add_argument("--tolerance-mm", type=float, default=20.0, metavar="MM", help="what counts as reached; default 20")
     p.add_argument("--json", action="store_true", help="print a JSON list")
     p.set_defaults(run=solve)

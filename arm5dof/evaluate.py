@@ -38,7 +38,7 @@ class EvaluateConfig:
     """Targets in the final evaluation."""
     interim_targets: Annotated[int, Ge(1)] = static(default=2_000)
     """Targets in the evaluations on the way."""
-    refinements: Annotated[int, Ge(0)] = static(default=3)
+    refinements: Annotated[int, Ge(0)] = static(default=10)
     """How often the policy is asked again for the `refined` and the `episode` figure."""
 
 
@@ -47,7 +47,7 @@ Accuracy = dict[str, Any]
 
 
 def evaluate(
-    policy: Policy, targets: int, refinements: int = 3, seed: int = 0, progress: Callable[[int], object] | None = None
+    policy: Policy, targets: int, refinements: int = 10, seed: int = 0, progress: Callable[[int], object] | None = None
 ) -> tuple[dict[str, Accuracy], float]:
     """Measure a policy on `targets` unseen targets.
 

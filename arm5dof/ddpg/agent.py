@@ -33,7 +33,7 @@ Count = Annotated[int, Ge(1)]
 class DDPGConfig:
     """The agent."""
 
-    actor_lr: Positive = 3e-3
+    actor_lr: Positive = 5e-3
     """Adam's step size for the actor at the start of training."""
     critic_lr: Positive = 3e-3
     """Adam's step size for the critic at the start of training."""
@@ -65,7 +65,7 @@ class DDPGConfig:
     """distance: Q is minus a learnt distance, for rewards that are minus a distance; scalar: Q is any number."""
     batch_size: Count = static(default=64)
     """Transitions in an update."""
-    updates_per_step: Count = static(default=64)
+    updates_per_step: Count = static(default=128)
     """Updates after each step of all environments."""
     actor_width: Count = static(default=128)
     """Units in a hidden layer of the actor."""
