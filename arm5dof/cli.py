@@ -96,7 +96,8 @@ def train(known: argparse.Namespace, rest: list[str]) -> None:
         given = {name.replace("-", "_").rsplit(".", 1)[-1] for name in overrides}
         smoke = {k: v for k, v in SMOKE.items() if k not in given} if known.smoke else {}
         settings = config.load(experiment, {**smoke, **overrides})
-        run.make_trainer(settings)  # What is wrong with the arm or the budget is said before a folder exists.
+        # What is wrong with the arm or the budget is said before a folder exists.
+        run.make_trainer(settings).check_memory()
         out = known.out or run.free_folder(Path(experiment).stem + ("-smoke" if known.smoke else ""))
         current = run.Run.create(settings, out)
     print(f"run {current.folder} on {run.device()}", file=sys.stderr)

@@ -102,6 +102,9 @@ def _train(run: Run) -> list[dict[str, Any]]:
     with Bar("training", budget.episodes, "episodes") as bar:
         bar.update(0, "compiling")
         if checkpoints.latest is None:
+            bar.say(
+                f"replay buffer: {run.config.ddpg.replay_capacity} transitions, {trainer.replay_bytes / 1e6:.1f} MB"
+            )
             trainer.start()
         else:
             trainer.state = checkpoints.restore(trainer.like)

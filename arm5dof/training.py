@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import psutil
 from annotated_types import Ge
 
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
@@ -74,12 +75,27 @@ class Trainer:
         self._epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1)
 
     @property
+    def replay_bytes(self) -> int:
+        """Memory that the replay buffer takes on the device."""
+        return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.like.replay))
+
+    @property
     def like(self) -> Training:
         """Shapes and types of the state."""
         return jax.eval_shape(self.agent.init, self.config.ddpg, jax.random.key(0))
 
+    def check_memory(self) -> None:
+        """Raises `UserError` if the replay buffer cannot fit into the device's memory."""
+        needed, free = self.replay_bytes, memory_free()
+        if needed > free:
+            raise UserError(
+                f"replay_capacity = {self.config.ddpg.replay_capacity} takes {needed / 1e9:.1f} GB and "
+                f"{free / 1e9:.1f} GB are free: choose a smaller one"
+            )
+
     def start(self) -> None:
         """Begin a new run."""
+        self.check_memory()
         self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
 
     def advance(self) -> dict[str, float]:
@@ -111,6 +127,14 @@ class Trainer:
         """The policy as it is now. Its networks are copies: the next epoch reuses the originals' memory."""
         networks = jax.tree.map(jnp.copy, self.state.networks)
         return Policy(self.env, self.agent, self.config.ddpg, networks)
+
+
+def memory_free() -> int:
+    """Bytes that the device's memory has left."""
+    found = jax.devices()[0].memory_stats()
+    if found and "bytes_limit" in found:
+        return found["bytes_limit"] - found["bytes_in_use"]
+    return psutil.virtual_memory().available
 
 
 class Counters(NamedTuple):

@@ -171,6 +171,7 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
         (["--site", "nose"], "no site 'nose'"),
         (["--episodes", "30"], "no multiple of num_envs"),
         (["--epoch-steps", "7"], "does not divide"),
+        (["--replay-capacity", "100000000000"], "GB are free: choose a smaller one"),
         (["--resume", "nowhere"], "no run"),
         (["--resume", "nowhere", "--seed", "3"], "leave out --seed"),
     ],
