@@ -40,7 +40,8 @@ class Env(Protocol):
 @runtime_checkable
 class GoalEnv(Protocol):
     """An environment whose reward depends on a goal, a point, in a known way, so that goals can be exchanged in
-    hindsight and the outcome of an action foreseen. Vectors without a batch axis, as everywhere."""
+    hindsight and the outcome of an action foreseen. Vectors without a batch axis, as everywhere. The goal of an
+    episode, (3,) metres, is kept in `info["goal"]`."""
 
     @property
     def action_size(self) -> int: ...
