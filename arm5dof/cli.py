@@ -45,6 +45,7 @@ SMOKE = {
     "checkpoint_every": "20",
     "targets": "500",
     "interim_targets": "500",
+    "updates_per_step": "32",
 }
 """What `--smoke` sets, unless the command line sets it otherwise."""
 

@@ -79,7 +79,7 @@ class Trainer:
         """Memory that the replay buffer takes on the device."""
         return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.like.replay))
 
-    @property
+    @cached_property
     def like(self) -> Training:
         """Shapes and types of the state."""
         return jax.eval_shape(self.agent.init, self.config.ddpg, jax.random.key(0))

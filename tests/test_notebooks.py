@@ -17,4 +17,4 @@ def test_notebook_runs(path, tmp_path):
     code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "refine=3" in done.stdout
+    assert "refine=10" in done.stdout
