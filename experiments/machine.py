@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 RESULTS = Path(__file__).parent / "results"
@@ -157,8 +158,9 @@ def replay() -> dict[str, float]:
     keys = jax.random.split(jax.random.key(0), 200)
     found = {}
     for capacity in (10_048, 100_032, 1_000_000, 10_000_000):
-        buffer = Replay.create(jax.tree.map(lambda x: x[0], batch), capacity)
-        buffer = insert(buffer).replace(size=jax.numpy.int32(capacity))
+        create = partial(Replay.create, capacity=capacity)
+        buffer = insert(jax.jit(create)(jax.tree.map(lambda x: x[0], batch)))
+        buffer = buffer.replace(size=jax.numpy.int32(capacity))
         start = time.perf_counter()
         for _ in range(1000):
             buffer = insert(buffer)
