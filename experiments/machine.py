@@ -100,7 +100,7 @@ def update() -> dict[str, float]:
     training = jax.jit(agent.init)(config, jax.random.key(0))
     training = jax.jit(lambda t: agent.collect(config, t)[0])(training)
     batches = training.replay.sample(jax.random.key(1), (count, config.batch_size))
-    learn = jax.jit(lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, b), t, b)[0].updates)
+    learn = jax.jit(lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, b), t, b)[0].networks)
 
     rows, heads = config.batch_size, config.heads
     actor = _layers(training.networks.actor)
