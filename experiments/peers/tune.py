@@ -44,7 +44,7 @@ BRAX = {**COMMON, "discounting": [0.0, 0.0, 0.9], "grad_updates_per_step": [16, 
 SPACES = {
     "sbx-DDPG": {**SBX, **NOISE},
     "sbx-TD3": {**SBX, **NOISE, "policy_delay": [1, 2]},
-    "sbx-SAC": {**SBX, "ent_coef": ["auto_0.01", "auto_0.001", "0.001", "0.0001"]},
+    "sbx-SAC": {**SBX, "ent_coef": ["auto_0.01", "auto_0.001", "auto_0.0001"]},
     "rejax-TD3": {**REJAX, "exploration_noise": [0.1, 0.3, 0.5, 1.0], "policy_delay": [1, 2]},
     "rejax-SAC": REJAX,
     "brax-SAC": {**BRAX, "reward_scaling": [10.0, 100.0, 1000.0]},
