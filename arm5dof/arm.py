@@ -79,37 +79,42 @@ class Arm:
         return data.xanchor[self.joints[0]].copy()
 
     def make_data(self, q: jax.Array) -> mjx.Data:
-        """Simulation data at joint positions `q`, everything else at rest. Call it inside `jit`: eager MJX data
-        carries other types than a step returns, and the next call would compile again."""
+        """Simulation data at joint positions `q`, everything else at rest; what follows from positions (`xpos` and
+        the like) is not computed. Call it inside `jit`: eager MJX data carries other types than a step returns, and
+        the next call would compile again."""
         qpos = jnp.asarray(self.rest, jnp.float32).at[self.qpos].set(q)
-        data = mjx.make_data(self.mjx_model).replace(qpos=qpos)
-        return mjx.kinematics(self.mjx_model, data)
+        return mjx.make_data(self.mjx_model).replace(qpos=qpos)
 
     def forward(self, q: jax.Array) -> jax.Array:
-        """Position of the end-effector site, (..., 3), at joint positions `q` (..., dof). Differentiable.
+        """Position of the end-effector site, (..., 3), at joint positions `q` (..., dof). Differentiable."""
+        return self._carry(q, self.dof)
+
+    def joint_positions(self, q: jax.Array) -> jax.Array:
+        """Where the joints are, (..., dof, 3), at joint positions `q` (..., dof); a slide's joint is where it slides
+        from."""
+        return jnp.stack([self._carry(q, k) for k in range(self.dof)], axis=-2)
+
+    def _carry(self, q: jax.Array, joints: int) -> jax.Array:
+        """The point behind the first so many joints, (..., 3).
 
         The same function of the same MJCF as `mjx.kinematics`, carried out on one point alone, from tip to base and
-        component by component: the critic calls it in every update, where carrying every body along is wasted.
+        component by component: the critic calls it in every update, where carrying every body along is wasted, and
+        `mjx.kinematics` takes seconds to compile.
         """
-        x, y, z = (jnp.full(q.shape[:-1], c, q.dtype) for c in self.chain[-1].offset)
-        for k in reversed(range(self.dof)):
-            link, value = self.chain[k], q[..., k]
+        x, y, z = (jnp.full(q.shape[:-1], c, q.dtype) for c in self.chain[joints].offset)
+        # The gradient of a split is one concatenation, that of indexing a sum of padded arrays.
+        split = lambda x: [v[..., 0] for v in jax.lax.split(x, (1,) * self.dof, axis=x.ndim - 1)]
+        values, cosines, sines = map(split, (q, *_cos_sin(q)))
+        for k in reversed(range(joints)):
+            link = self.chain[k]
             if link.slides:
-                z = z + value
+                z = z + values[k]
             else:
-                c, s = jnp.cos(value), jnp.sin(value)
+                c, s = cosines[k], sines[k]
                 x, y = c * x - s * y, s * x + c * y
             point = (x, y, z)
             x, y, z = (_row(*constants, point) for constants in zip(link.rotation, link.offset, strict=True))
         return jnp.stack([x, y, z], axis=-1)
-
-    def end_effector(self, data: mjx.Data) -> jax.Array:
-        """Position of the end-effector site, (3,)."""
-        return data.site_xpos[self.site]
-
-    def joint_positions(self, data: mjx.Data) -> jax.Array:
-        """Where the joints are, (dof, 3)."""
-        return data.xanchor[self.joints]
 
     def to_joints(self, action: jax.Array) -> jax.Array:
         """Map actions in [-1, 1] to joint positions inside the limits; (..., dof) to (..., dof)."""
@@ -126,6 +131,20 @@ class Arm:
     def sample(self, key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:
         """Joint positions drawn uniformly inside the limits, shape + (dof,), float32."""
         return self.to_joints(jax.random.uniform(key, (*shape, self.dof), minval=-1.0, maxval=1.0))
+
+
+@jax.custom_jvp
+def _cos_sin(q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Computed once, and kept for the gradient: XLA would do it again for every term that they appear in."""
+    return jax.lax.optimization_barrier((jnp.cos(q), jnp.sin(q)))
+
+
+@_cos_sin.defjvp
+def _cos_sin_jvp(
+    primals: tuple[jax.Array], tangents: tuple[jax.Array]
+) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    cosine, sine = _cos_sin(*primals)
+    return (cosine, sine), (-sine * tangents[0], cosine * tangents[0])
 
 
 def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
@@ -196,11 +215,12 @@ def _chain(model: mujoco.MjModel, path: list[int], site: int) -> tuple[Link, ...
         for j in range(first, first + model.body_jntnum[body]):
             slides = bool(model.jnt_type[j] == SLIDE)
             align, anchor = _z_towards(model.jnt_axis[j]), model.jnt_pos[j]
-            zero = np.array([0, 0, model.qpos0[model.jnt_qposadr[j]]])
+            zero = model.qpos0[model.jnt_qposadr[j]]
             move(align, anchor)
-            move(np.eye(3), -zero) if slides else move(_about_z(-zero[2]), np.zeros(3))
             links.append(Link(slides, _clean(rotation), _clean(offset)))
-            rotation, offset = align.T, -align.T @ anchor
+            rotation, offset = np.eye(3), np.zeros(3)
+            move(np.eye(3), np.array([0, 0, -zero])) if slides else move(_about_z(-zero), np.zeros(3))
+            move(align.T, -align.T @ anchor)
     move(np.eye(3), model.site_pos[site])
     return (*links, Link(False, np.eye(3), _clean(offset)))
 

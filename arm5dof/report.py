@@ -6,16 +6,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from arm5dof import files
 from arm5dof.evaluate import table
 
+# Drawing is imported where something is drawn: a run's first step need not wait for it.
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from arm5dof.config import Config
 
 PAPER_TABLE_2 = {
@@ -45,6 +44,8 @@ def headline(config: Config) -> str:
 
 def write(folder: Path, config: Config, rows: list[dict[str, Any]], evaluations: list[dict[str, Any]]) -> None:
     """Write the figures and `report.md` into a run's folder."""
+    import matplotlib
+
     curve = {
         name: np.array([float(row[name]) for row in rows]) for name in ("env_steps", "distance", "policy_distance")
     }
@@ -71,6 +72,8 @@ def figure_7(curve: Curve, episode_length: int) -> Figure:
 def figure_8(curve: Curve, episode_length: int, evaluations: list[dict[str, Any]]) -> Figure:
     """The paper's Figure 8: distance between end effector and object against episodes, normalised by its first
     value; and the error of one answer of the policy in millimetres, its median on unseen targets as dots."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     figure, axes = _axes("normalised error")
     _plot(axes, curve, episode_length, lambda distance, first: distance / first)
     axes.set_ylim(0, 1.05)
@@ -148,11 +151,15 @@ end of an episode, on average.
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, atomically."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     with files.replacing(path) as temporary:
         FigureCanvasAgg(figure).print_figure(str(temporary))
 
 
 def _axes(label: str) -> tuple[Figure, Any]:
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.add_subplot()
     axes.set_xlabel("episodes")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import psutil
 from annotated_types import Ge
 
+from arm5dof import xla
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Reach
 from arm5dof.errors import UserError
@@ -71,8 +72,8 @@ class Trainer:
         self.config = config
         self.total_steps = budget.episodes // budget.num_envs * length
         self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
-        self._init = jax.jit(self.agent.init)
-        self._epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1)
+        self._init = jax.jit(self.agent.init, compiler_options=xla.effort(0))
+        self._epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1, compiler_options=xla.effort(2))
 
     @property
     def replay_bytes(self) -> int:
@@ -82,7 +83,7 @@ class Trainer:
     @cached_property
     def like(self) -> Training:
         """Shapes and types of the state."""
-        return jax.eval_shape(self.agent.init, self.config.ddpg, jax.random.key(0))
+        return self._init.eval_shape(self.config.ddpg, jax.random.key(0))
 
     def check_memory(self) -> None:
         """Raises `UserError` if the replay buffer cannot fit into the device's memory."""

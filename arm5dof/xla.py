@@ -29,6 +29,14 @@ def configure() -> None:
         os.environ["XLA_FLAGS"] = chosen
 
 
+def effort(level: int) -> dict[str, int]:
+    """`compiler_options` of `jax.jit` for a CPU: how hard LLVM tries, 0 to 3. 3 is XLA's own choice; 2 takes three
+    quarters of its time for programs as fast, and what runs only once can do with 0."""
+    import jax  # This module is imported before it, to set its flags.
+
+    return {"xla_backend_optimization_level": level} if jax.default_backend() == "cpu" else {}
+
+
 def enable_compilation_cache() -> None:
     """Keep compiled programs on disk between runs, unless the user has said where or that they want none."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

@@ -93,6 +93,7 @@ def update() -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
+    from arm5dof import xla
     from arm5dof.ddpg import DDPG, DDPGConfig
 
     config, count = DDPGConfig(), 512
@@ -100,7 +101,8 @@ def update() -> dict[str, float]:
     training = jax.jit(agent.init)(config, jax.random.key(0))
     training = jax.jit(lambda t: agent.collect(config, t)[0])(training)
     batches = training.replay.sample(jax.random.key(1), (count, config.batch_size))
-    learn = jax.jit(lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, b), t, b)[0].networks)
+    scan = lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, b), t, b)[0].networks
+    learn = jax.jit(scan, compiler_options=xla.effort(2))
 
     rows, heads = config.batch_size, config.heads
     actor = _layers(training.networks.actor)
@@ -120,7 +122,7 @@ def update() -> dict[str, float]:
 
         return jax.lax.scan(step, jnp.zeros(()), None, count)[0]
 
-    bare = jax.jit(bare)
+    bare = jax.jit(bare, compiler_options=xla.effort(2))
     pairs = [(seconds(lambda: bare(operands), 1), seconds(lambda: learn(training, batches), 1)) for _ in range(REPEATS)]
     return {
         "matrix products, ms": 1e3 * statistics.median(b for b, _ in pairs) / count,
@@ -144,6 +146,37 @@ def _products(layers: list[tuple[int, int]], rows: int, passes: int) -> list[tup
     return shapes
 
 
+def profile() -> dict[str, float]:
+    """What a training step of the default experiment consists of: 50 environments, 128 updates."""
+    import jax
+
+    from arm5dof import config, run, xla
+
+    trainer = run.make_trainer(config.load("reach.toml"))
+    agent, ddpg = trainer.agent, trainer.config.ddpg
+    jit = partial(jax.jit, compiler_options=xla.effort(2))
+    trainer.start()
+    trainer.advance()
+    state = trainer.state
+    shape = (ddpg.updates_per_step, ddpg.batch_size)
+    key = jax.random.key(0)
+    collect = jit(agent.collect)
+    draw = jit(lambda t: agent.relabel(ddpg, t.replay, t.replay.sample(key, shape), key))
+    batches = draw(state)
+    learn = jit(lambda t, b: jax.lax.scan(lambda t, b: agent.update(ddpg, t, b), t, b))
+    epoch = jit(agent.epoch, static_argnums=2)
+    steps = trainer.config.train.epoch_steps
+    parts = {
+        "environments and replay insert, ms": lambda: collect(ddpg, state),
+        "sampling and hindsight, ms": lambda: draw(state),
+        "updates, ms": lambda: learn(state, batches),
+        "a whole step, ms": lambda: epoch(ddpg, state, steps),
+    }
+    found = {name: 1e3 * seconds(call) for name, call in parts.items()}
+    found["a whole step, ms"] /= steps
+    return found
+
+
 def replay() -> dict[str, float]:
     """An insert of 64 and a sample of 64 x 64 transitions, at capacities up to ten million."""
     import jax
@@ -151,15 +184,15 @@ def replay() -> dict[str, float]:
     from arm5dof.ddpg import DDPG, DDPGConfig, Replay, Transition
 
     agent = DDPG(reach("kinematic"), DDPGConfig(), num_envs=64, episode_length=160, total_steps=1000)
-    like = jax.eval_shape(agent.init, DDPGConfig(), jax.random.key(0)).replay.storage
-    batch: Transition = jax.tree.map(lambda x: jax.numpy.ones((64, *x.shape[1:]), x.dtype), like)
+    one = jax.jit(lambda key: agent.init(DDPGConfig(), key).replay.sample(key, ()))(jax.random.key(0))
+    batch: Transition = jax.tree.map(lambda x: jax.numpy.ones((64, *x.shape), x.dtype), one)
     insert = jax.jit(lambda r: r.insert(batch), donate_argnums=0)
     sample = jax.jit(lambda r, key: jax.tree.map(jax.numpy.sum, r.sample(key, (64, 64))))
     keys = jax.random.split(jax.random.key(0), 200)
     found = {}
     for capacity in (10_048, 100_032, 1_000_000, 10_000_000):
         create = partial(Replay.create, capacity=capacity)
-        buffer = insert(jax.jit(create)(jax.tree.map(lambda x: x[0], batch)))
+        buffer = insert(jax.jit(create)(one))
         buffer = buffer.replace(size=jax.numpy.int32(capacity))
         start = time.perf_counter()
         for _ in range(1000):
@@ -172,10 +205,10 @@ def replay() -> dict[str, float]:
 
 
 def first_step() -> dict[str, float]:
-    """Compile `arm5dof train`'s epoch of the default experiment and take it; nothing else."""
+    """Compile the default experiment's program and take one step of every environment, gradient steps included."""
     from arm5dof import config, run
 
-    trainer = run.make_trainer(config.load("reach.toml"))
+    trainer = run.make_trainer(config.load("reach.toml", {"epoch_steps": "1"}))
     trainer.start()
     trainer.advance()
     return {}
@@ -193,7 +226,7 @@ def bare_step() -> dict[str, float]:
     return {}
 
 
-PARTS = {f.__name__: f for f in (env, flag, update, replay, first_step, bare_step)}
+PARTS = {f.__name__: f for f in (env, flag, update, profile, replay, first_step, bare_step)}
 
 
 def alone(part: str, cache: Path | None = None, **environment: str) -> tuple[dict[str, float], float]:
@@ -241,6 +274,7 @@ def main() -> None:
             "ratio": ours / default,
         },
         "start of a process": starts(),
+        "a training step": alone("profile")[0],
         "gradient step": alone("update")[0],
         "replay buffer": alone("replay")[0],
     }

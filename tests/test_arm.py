@@ -18,6 +18,7 @@ from arm5dof.arm import Arm, load
 from arm5dof.envs import ReachConfig
 from arm5dof.errors import UserError
 from arm5dof.kinematics import TABLE_1
+from arm5dof.mjx import mjx
 
 SUBSTEPS = ReachConfig().substeps
 TENTH_OF_A_MILLIMETRE = 1e-4
@@ -107,10 +108,12 @@ def test_forward_is_mujocos_on_random_arms(dof: int, seed: int, slides: bool, fi
     poses = random_poses(arm, 16, seed)
     with jax.enable_x64(True):
         position = np.asarray(arm.forward(jnp.asarray(poses)))
+        joints = np.asarray(arm.joint_positions(jnp.asarray(poses)))
     assert position.dtype == np.float64
-    for q, found in zip(poses, position, strict=True):
+    for i, q in enumerate(poses):
         place(arm, data, q)
-        np.testing.assert_allclose(found, data.site_xpos[arm.site], atol=1e-12, rtol=0)
+        np.testing.assert_allclose(position[i], data.site_xpos[arm.site], atol=1e-12, rtol=0)
+        np.testing.assert_allclose(joints[i], data.xanchor[arm.joints], atol=1e-12, rtol=0)
 
 
 @given(dofs, seeds, st.booleans(), st.booleans())
@@ -130,9 +133,10 @@ def test_gradient_is_mujocos_jacobian_on_random_arms(dof: int, seed: int, slides
 def test_forward_is_mjxs_kinematics(dof: int, slides: bool):
     arm = load(serial_arm(dof, seed=dof, slides=slides, finger=True))
     poses = jnp.asarray(random_poses(arm, 64), jnp.float32)
-    by_mjx = jax.jit(jax.vmap(lambda q: arm.end_effector(arm.make_data(q))))(poses)
-    scale = np.abs(by_mjx).max()
-    np.testing.assert_allclose(arm.forward(poses), by_mjx, atol=2e-6 * scale, rtol=0)
+    data = jax.jit(jax.vmap(lambda q: mjx.kinematics(arm.mjx_model, arm.make_data(q))))(poses)
+    atol = 2e-6 * np.abs(data.site_xpos).max()
+    np.testing.assert_allclose(arm.forward(poses), data.site_xpos[:, arm.site], atol=atol, rtol=0)
+    np.testing.assert_allclose(arm.joint_positions(poses), data.xanchor[:, arm.joints], atol=atol, rtol=0)
 
 
 @given(dofs, seeds, st.booleans())

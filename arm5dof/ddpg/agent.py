@@ -56,7 +56,7 @@ class DDPGConfig:
     """Share of sampled transitions whose goal is exchanged in hindsight for a point reached in another one."""
     temperature: Positive = 0.01
     """How sharply heads divide the targets among them, in units of reward (metres)."""
-    heads: Count = static(default=4)
+    heads: Count = static(default=8)
     """Candidate answers of the actor, among which the critic chooses. 1 is plain DDPG."""
     critic_view: Literal["outcome", "state"] = static(default="outcome")
     """outcome: the critic sees where the action leads by the arm's forward model, as the paper's does; state: it

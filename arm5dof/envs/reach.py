@@ -65,21 +65,22 @@ class Reach:
 
     def reset(self, key: jax.Array) -> State:
         """A random pose and a fresh, reachable goal: forward kinematics of another random pose."""
-        pose_key, goal_key = jax.random.split(key)
-        return self.start(self.arm.sample(pose_key), self.sample_goal(goal_key))
+        pose, other = self.arm.sample(key, (2,))
+        return self.start(pose, self.arm.forward(other))
 
     def sample_goal(self, key: jax.Array) -> jax.Array:
         """A reachable point, (3,) metres: the end effector of joint positions drawn uniformly inside the limits."""
         return self.arm.forward(self.arm.sample(key))
 
     def start(self, q: jax.Array, goal: jax.Array) -> State:
-        """The state at rest in pose `q` (dof,) with goal (3,) in metres."""
+        """The state at rest in pose `q` (dof,) with goal (3,) in metres. As after MJX's own steps, `data` holds what
+        follows from positions (`xpos` and the like) as it was before they changed, or not at all."""
         data = self.arm.make_data(q)
         if self._marker >= 0:
             data = data.replace(mocap_pos=data.mocap_pos.at[self._marker].set(goal))
-        distance = self._distance(data, goal)
+        obs, distance = self._observe(data, goal)
         zero = jnp.zeros(())
-        return State(data, self._observe(data, goal), zero, zero, {"distance": distance}, {"goal": goal})
+        return State(data, obs, zero, zero, {"distance": distance}, {"goal": goal})
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step. `action` is (dof,) in [-1, 1], mapped to joint targets inside the limits."""
@@ -90,11 +91,8 @@ class Reach:
             data = jax.lax.fori_loop(0, self.config.substeps, lambda _, d: mjx.step(self.arm.mjx_model, d), data)
         else:
             data = data.replace(qpos=data.qpos.at[self.arm.qpos].set(target))
-        data = mjx.kinematics(self.arm.mjx_model, data)
-        distance = self._distance(data, goal)
-        return state.replace(
-            data=data, obs=self._observe(data, goal), reward=-distance, metrics={**state.metrics, "distance": distance}
-        )
+        obs, distance = self._observe(data, goal)
+        return state.replace(data=data, obs=obs, reward=-distance, metrics={**state.metrics, "distance": distance})
 
     def achieved(self, obs: Observation) -> jax.Array:
         """Where the end effector is, (3,) metres."""
@@ -122,21 +120,20 @@ class Reach:
         target = obs["privileged_state"][-3:]
         return jnp.concatenate([action, end_effector, target, end_effector - target])
 
-    def _observe(self, data: mjx.Data, goal: jax.Array) -> Observation:
-        target = self._scaled(goal)
-        q = self.arm.to_action(data.qpos[self.arm.qpos])
-        end_effector = self._scaled(self.arm.end_effector(data))
-        joints = self._scaled(self.arm.joint_positions(data))
+    def _observe(self, data: mjx.Data, goal: jax.Array) -> tuple[Observation, jax.Array]:
+        """The observation, and the distance between end effector and goal in metres."""
+        pose = data.qpos[self.arm.qpos]
+        position = self.arm.forward(pose)
+        q, end_effector, target = self.arm.to_action(pose), self._scaled(position), self._scaled(goal)
         state = target
         if self.config.observation != "goal":
+            joints = self._scaled(self.arm.joint_positions(pose))
             state = jnp.concatenate([joints.ravel(), (target - joints).ravel()])
         if self.config.observation == "full":
             moved = data.qvel[self.arm.dofs] * self.arm.mj_model.opt.timestep * self.config.substeps
             state = jnp.concatenate([state, q, moved, end_effector, target])
-        return {"state": state, "privileged_state": jnp.concatenate([q, end_effector, target])}
+        obs = {"state": state, "privileged_state": jnp.concatenate([q, end_effector, target])}
+        return obs, jnp.linalg.norm(position - goal)
 
     def _scaled(self, points: jax.Array) -> jax.Array:
         return (points - self._origin) / self.arm.reach
-
-    def _distance(self, data: mjx.Data, goal: jax.Array) -> jax.Array:
-        return jnp.linalg.norm(self.arm.end_effector(data) - goal)
