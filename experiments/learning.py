@@ -5,7 +5,7 @@
     python experiments/learning.py budgets --rows 25 --seeds 1   only rows with "25" in their name; nothing is written
 
 All rows are judged on 10,000 unseen targets at the end of training. Runs are left in runs/learning/ and resumed if they
-are there already.
+are there already; the rows that Table 2 has, too, are taken from experiments/results/ (table2.py).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ STATE = "--critic-view state --critic-width 128 --critic-depth 3"
 BUDGETS = {
     "25 episodes, kinematic": "kinematic.toml --episodes 25 --num-envs 25",
     "100 episodes, kinematic": "kinematic.toml --episodes 100",
-    "400 episodes, kinematic": "kinematic.toml",
+    "400 episodes, kinematic": "table2_kinematic.json",
     "100 episodes, servo": "reach.toml --episodes 100",
-    "400 episodes, servo": "reach.toml",
+    "400 episodes, servo": "table2_reach.json",
     "25 episodes, kinematic, state critic": f"kinematic.toml --episodes 25 --num-envs 25 {STATE}",
     "100 episodes, kinematic, state critic": f"kinematic.toml --episodes 100 {STATE}",
     "400 episodes, kinematic, state critic": f"kinematic.toml {STATE}",
@@ -47,12 +47,13 @@ ABLATIONS = {
     "scalar critic of width 128, depth 3": f"{BASE} --critic-form scalar --critic-width 128 --critic-depth 3",
     "state critic": f"{BASE} {STATE}",
     "one head": f"{BASE} --heads 1",
-    "two heads": f"{BASE} --heads 2",
-    "eight heads": f"{BASE} --heads 8",
+    "four heads": f"{BASE} --heads 4",
+    "sixteen heads": f"{BASE} --heads 16",
     "constant step size": f"{BASE} --final-lr 1",
     "Adam's usual memory of 0.999": f"{BASE} --adam-b2 0.999",
     "batch 256": f"{BASE} --batch-size 256",
     "a quarter of the updates, batch 256": f"{BASE} --batch-size 256 --updates-per-step 16",
+    "discount 0.9": f"{BASE} --discount 0.9",
     "actor of width 64": f"{BASE} --actor-width 64",
     "actor of width 256": f"{BASE} --actor-width 256",
     "layer norm": f"{BASE} --layer-norm true",
@@ -86,7 +87,10 @@ def main() -> None:
 
 
 def train(name: str, line: str, seed: int) -> dict:
-    """The last evaluation of one run, trained now or before. `line` is what `arm5dof train` would be given."""
+    """The last evaluation of one run, trained now or before. `line` is what `arm5dof train` would be given, or a file
+    of Table 2's results."""
+    if line.endswith(".json"):
+        return json.loads((RESULTS / line).read_text())[seed][-1]
     experiment, *options = line.split()
     overrides = {option[2:]: value for option, value in zip(options[::2], options[1::2], strict=True)}
     episodes = overrides.get("episodes", "400")
