@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,6 +20,15 @@ if TYPE_CHECKING:
 
 settings.register_profile("arm5dof", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("arm5dof")
+
+
+@pytest.fixture(scope="session")
+def test_data() -> Path:
+    """The folder of real data that is no part of the project: photographs and published calibrations."""
+    folder = Path(os.environ.get("ARM5DOF_TEST_DATA") or Path(__file__).parent.parent.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no test data in {folder}: name the folder in ARM5DOF_TEST_DATA")
+    return folder
 
 
 @pytest.fixture(scope="session")
