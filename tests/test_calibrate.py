@@ -1,0 +1,266 @@
+"""Calibration: OpenCV's photographs against OpenCV's published calibration, and boards drawn through known cameras."""
+
+import cv2
+import numpy as np
+import pytest
+
+from arm5dof.errors import UserError
+from arm5dof.vision import boards
+from arm5dof.vision.boards import Charuco, Checkerboard, Corners
+from arm5dof.vision.calibrate import MIN_VIEWS, View, calibrate, extrinsics, find_views, fit, preview
+from arm5dof.vision.camera import Camera
+
+BOARD = Checkerboard(9, 6, 0.025)
+
+
+@pytest.fixture(scope="module")
+def photographs(test_data):
+    paths = sorted((test_data / "vision/checkerboard").glob("left*.jpg"))
+    assert len(paths) == 13
+    return paths
+
+
+@pytest.fixture(scope="module")
+def views(photographs):
+    return find_views(photographs, BOARD)
+
+
+def test_thirteen_photographs_give_a_camera(views):
+    result = calibrate(views)
+    assert len(views.found) == 13 and not views.without and not result.outliers
+    assert result.rms <= 0.24
+    fx, fy, cx, cy, *_ = result.intrinsics
+    assert abs(fx - 532.3) <= 1 and abs(fy - 532.3) <= 1
+    assert abs(cx - 342.4) <= 2 and abs(cy - 233.2) <= 2
+    assert (result.deviations[:4] > 0.1).all() and (result.deviations[:4] < 0.6).all()
+    assert list(result.errors) == [view.name for view in views.found]
+    assert (result.camera.width, result.camera.height, result.camera.posed) == (640, 480, False)
+
+
+def test_opencvs_published_calibration_is_reproduced_with_its_settings(photographs, views, test_data):
+    """Its sample refines in windows of 11 pixels until corners move by less than 0.1, and fixes the aspect ratio."""
+    path = test_data / "vision/checkerboard/left_intrinsics.yml"
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.1)
+    rough = []
+    for path_, view in zip(photographs, views.found, strict=True):
+        grey = cv2.imread(str(path_), cv2.IMREAD_GRAYSCALE)
+        _, pixels = cv2.findChessboardCorners(grey, (9, 6), flags=3)
+        rough.append(
+            View(view.name, Corners(BOARD.points, boards.refine(grey, pixels.reshape(-1, 2), window=11, until=until)))
+        )
+    result = fit(rough, views.size, flags=cv2.CALIB_FIX_ASPECT_RATIO)
+    node = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert result.rms == pytest.approx(node.getNode("avg_reprojection_error").real(), abs=0.01)
+    published = Camera.load(path)
+    np.testing.assert_allclose(result.camera.matrix, published.matrix, atol=0.05)
+    np.testing.assert_allclose(result.camera.distortion, published.distortion, atol=2e-3)
+    errors = node.getNode("per_view_reprojection_errors").mat().ravel()
+    np.testing.assert_allclose(list(result.errors.values()), errors, atol=0.05)
+
+
+@pytest.mark.parametrize("coefficients", [4, 5, 8])
+def test_as_many_coefficients_as_asked_for(views, coefficients):
+    result = fit(views.found, views.size, coefficients)
+    assert result.camera.distortion.shape == (coefficients,) and result.deviations.shape == (4 + coefficients,)
+    assert result.rms < 0.19
+
+
+def test_too_few_views_are_refused(photographs, views):
+    with pytest.raises(UserError, match=f"1 of 1 photographs show the 9x6 checkerboard and .* takes {MIN_VIEWS}"):
+        find_views(photographs[:1], BOARD)
+    copies = [View(f"copy {i}", views.found[0].corners) for i in range(13)]
+    with pytest.raises(UserError, match="only 1 of 13 views differ"):
+        calibrate(views._replace(found=copies))
+
+
+def test_uncertain_intrinsics_are_refused(views):
+    """A hand that moves sideways, never tilting the board: it all fits, and says little of the focal length."""
+    start = views.found[0].corners
+    shifts = [(x, y) for x in (0, 60) for y in (0, 30, 60)]
+    shifted = [View(str(s), Corners(start.points, start.pixels + np.float32(s))) for s in shifts]
+    assert fit(shifted, views.size).rms < 1
+    with pytest.raises(UserError, match=r"f[xy] = .* \+- .* is the limit: add photographs"):
+        calibrate(views._replace(found=shifted))
+
+
+@pytest.mark.parametrize("size", [(8, 6), (9, 7), (7, 5), (3, 3), (12, 9)])
+def test_another_size_of_board_is_refused_with_the_right_one(size, photographs):
+    """OpenCV finds 8x6 corners in twelve of the photographs of the 9x6 board, and would calibrate with them."""
+    with pytest.raises(UserError, match="show one of 9x6 inner corners: give --board 9x6"):
+        find_views(photographs[::2], Checkerboard(*size, 0.025))
+
+
+@pytest.mark.parametrize("zoom", [0.8, 1.2])
+def test_a_view_from_another_camera_is_named(zoom, photographs, views):
+    """The last photograph as a lens of another focal length would have taken it."""
+    grey = cv2.imread(str(photographs[-2]), cv2.IMREAD_GRAYSCALE)
+    middle = np.array([319.5, 239.5])
+    warp = np.c_[zoom * np.eye(2), (1 - zoom) * middle]
+    other = BOARD.find(cv2.warpAffine(grey, warp, (640, 480), borderValue=200))
+    mixed = [*views.found[:-2], View("other.jpg", other), views.found[-1]]
+    result = calibrate(views._replace(found=mixed))
+    assert list(result.outliers) == ["other.jpg"] and result.outliers["other.jpg"] > 1
+    assert "other.jpg" not in result.errors and len(result.errors) == 12
+    assert result.rms < 0.2 and abs(result.intrinsics[0] - 532.3) < 1.5
+
+
+def test_views_that_contradict_each_other_are_refused(views):
+    stretched = [
+        View(v.name, Corners(v.corners.points, v.corners.pixels * np.float32([1, 1 + 0.05 * (i % 5)])))
+        for i, v in enumerate(views.found)
+    ]
+    with pytest.raises(UserError, match="do not fit the others"):
+        calibrate(views._replace(found=stretched))
+
+
+def test_photographs_of_different_sizes_are_named(photographs, tmp_path):
+    small = tmp_path / "small.png"
+    cv2.imwrite(str(small), cv2.resize(cv2.imread(str(photographs[0])), (320, 240)))
+    with pytest.raises(UserError, match=r"most have 640x480 pixels, but not small.png \(320x240\)"):
+        find_views([*photographs[:3], small], BOARD)
+
+
+def test_files_that_are_no_photographs_are_named(photographs, tmp_path):
+    for name, content, said in [
+        ("empty.png", b"", "is empty"),
+        ("words.jpg", b"hello", "no image"),
+        ("half.jpg", photographs[0].read_bytes()[:200], "no image"),
+    ]:
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError, match=f"{name} .*{said}"):
+            find_views([photographs[0], tmp_path / name], BOARD)
+
+
+def test_pictures_without_a_board(tmp_path):
+    paths = []
+    for i in range(6):
+        paths.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(paths[-1]), np.random.default_rng(i).integers(0, 255, (240, 320), np.uint8))
+    with pytest.raises(UserError, match="0 of 6 photographs show the 9x6 checkerboard; none of them shows any"):
+        find_views(paths, BOARD)
+
+
+TRUE = Camera(
+    matrix=np.array([[700, 0, 321.5], [0, 705, 236], [0, 0, 1.0]]),
+    distortion=np.array([-0.2, 0.05, 1e-3, -5e-4, 0]),
+    rotation=np.eye(3),
+    position=np.zeros(3),
+    width=640,
+    height=480,
+)
+
+
+def photograph(drawing, metres_per_pixel, origin, pose, camera=TRUE, oversampling=2):
+    """What a camera sees of a drawing whose pixel `origin` is the board's origin, at the board's pose (4, 4) in the
+    camera's frame, found by casting the pixels' rays."""
+    n = oversampling
+    u, v = np.meshgrid((np.arange(n * camera.width) + 0.5) / n - 0.5, (np.arange(n * camera.height) + 0.5) / n - 0.5)
+    pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
+    rays = cv2.undistortPoints(pixels, camera.matrix, camera.distortion)[:, 0]
+    homography = np.linalg.inv(np.c_[pose[:3, :2], pose[:3, 3]])
+    place = np.c_[rays, np.ones(len(rays))] @ homography.T
+    place = (place[:, :2] / place[:, 2:] / metres_per_pixel + origin).astype(np.float32).reshape(*u.shape, 2)
+    picture = cv2.remap(drawing, place, None, cv2.INTER_LINEAR, borderValue=200)
+    return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+def poses(rng, n, middle, distance=0.5):
+    """Board poses (4, 4) in front of the camera, tilted by up to 40 degrees."""
+    for _ in range(n):
+        turn, _ = cv2.Rodrigues(np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1)]))
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        at = np.array([*rng.uniform(-0.06, 0.06, 2), distance * rng.uniform(0.9, 1.3)])
+        pose[:3, 3] = at - turn @ [*middle, 0]
+        yield pose
+
+
+def draw(board):
+    """A drawing, its metres per pixel, and the pixel of the board's origin."""
+    scale = 24
+    if isinstance(board, Charuco):
+        picture = board.opencv.generateImage((scale * board.columns, scale * board.rows), marginSize=0)
+        return picture, board.square / scale, np.array([scale - 0.5, scale - 0.5])
+    squares = np.indices((board.rows + 1, board.columns + 1)).sum(0) % 2 * 255
+    picture = cv2.copyMakeBorder(
+        np.kron(squares, np.ones((scale, scale))).astype(np.uint8), *[scale] * 4, cv2.BORDER_CONSTANT, value=255
+    )
+    return picture, board.square / scale, np.array([2 * scale - 0.5, 2 * scale - 0.5])
+
+
+@pytest.mark.parametrize("board", [Charuco(8, 6, 0.03, 0.022), Checkerboard(8, 5, 0.03)], ids=str)
+def test_drawn_boards_give_the_camera_they_were_drawn_through(board, tmp_path):
+    drawing, rng = draw(board), np.random.default_rng(0)
+    paths = []
+    for i, pose in enumerate(poses(rng, 10, (0.1, 0.06))):
+        paths.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(paths[-1]), photograph(*drawing, pose))
+    views = find_views(paths, board)
+    assert len(views.found) >= 8
+    result = calibrate(views, 4)
+    assert result.rms < 0.15
+    true = [700, 705, 321.5, 236, *TRUE.distortion[:4]]
+    assert np.abs(result.intrinsics[:4] - true[:4]).max() < 1.5
+    assert (np.abs(result.intrinsics - true) < 5 * result.deviations + 1e-3).all()
+
+
+@pytest.mark.parametrize("board", [Charuco(8, 6, 0.03, 0.022), Checkerboard(8, 5, 0.03)], ids=str)
+@pytest.mark.parametrize("turn", [0.3, 2.9])
+def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
+    """The board lies on the table, upright or upside down in the picture; the camera's pose comes out the same."""
+    pose = next(poses(np.random.default_rng(1), 1, (0.1, 0.06)))
+    spin = np.eye(4)
+    spin[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    middle = np.eye(4)
+    middle[:2, 3] = 0.1, 0.06
+    pose = pose @ middle @ spin @ np.linalg.inv(middle)
+    path = tmp_path / "board.png"
+    cv2.imwrite(str(path), photograph(*draw(board), pose))
+    board_to_base = np.array([[0, 1, 0, 0.2], [1, 0, 0, 0.1], [0, 0, -1, 0], [0, 0, 0, 1.0]])
+    camera = extrinsics(TRUE, path, board, board_to_base)
+    expected = board_to_base @ np.linalg.inv(pose)
+    np.testing.assert_allclose(camera.position, expected[:3, 3], atol=1e-3)
+    np.testing.assert_allclose(camera.rotation, expected[:3, :3], atol=3e-3)
+    assert camera.posed and camera.position[2] > 0.3
+
+    with pytest.raises(UserError, match="640x480 pixels and the camera 320x240"):
+        extrinsics(TRUE.replace(width=320, height=240), path, board, board_to_base)
+    with pytest.raises(UserError, match="does not show the 6x9 checkerboard"):
+        extrinsics(TRUE, path, Checkerboard(6, 9, 0.025), board_to_base)
+    with pytest.raises(UserError, match="after half a turn"):
+        extrinsics(TRUE, path, Checkerboard(9, 7, 0.025), board_to_base)
+    wrong = TRUE.replace(distortion=np.array([3.0, 0, 0, 0, 0]))
+    with pytest.raises(UserError, match="is this the camera that was calibrated"):
+        extrinsics(wrong, path, board, board_to_base)
+
+
+def test_charuco_boards_that_do_not_exist_or_are_another_size():
+    for arguments, said in [
+        ((8, 6, 0.03, 0.03), "do not fit into squares"),
+        ((8, 6, 0.03, 0.02, "DICT_9X9"), "no marker dictionary 'DICT_9X9'"),
+        ((20, 20, 0.03, 0.02, "DICT_4X4_50"), "needs 200 markers"),
+        ((2, 6, 0.03, 0.02), "at least 3x3"),
+    ]:
+        with pytest.raises(UserError, match=said):
+            Charuco(*arguments)
+    with pytest.raises(UserError, match="give the side of a square in metres"):
+        Checkerboard(9, 6, 25)
+    picture, *_ = draw(Charuco(8, 6, 0.03, 0.022))
+    small = Charuco(5, 4, 0.03, 0.022)
+    assert "markers 0 to 9 and the photographs show some up to 23" in small.mismatch([small.inspect(picture, None)])
+
+
+def test_the_preview_straightens_lines(photographs, views):
+    """Corners of a row, straight on the board, lie on a line in the right half as they do not in the left."""
+    camera = calibrate(views).camera
+    picture = preview(photographs[0], camera)
+    assert picture.shape == (480, 1280, 3)
+
+    def bend(half):
+        grid = BOARD.find(cv2.cvtColor(half, cv2.COLOR_BGR2GRAY)).pixels.reshape(6, 9, 2)
+        away = grid - (grid[:, :1] + (grid[:, -1:] - grid[:, :1]) * np.linspace(0, 1, 9)[:, None])
+        normal = (grid[:, -1] - grid[:, 0])[:, ::-1] * [1, -1]
+        return np.abs((away * (normal / np.linalg.norm(normal, axis=-1, keepdims=True))[:, None]).sum(-1)).max()
+
+    left, right = (bend(np.ascontiguousarray(half)) for half in np.split(picture, 2, axis=1))
+    assert right < 0.5 and 3 * right < left
