@@ -1,4 +1,4 @@
-"""The command line: `arm5dof train | eval | solve`."""
+"""The command line: `arm5dof train | eval | solve | vision`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from arm5dof import __version__, files, targets_csv, xla
 from arm5dof.errors import UserError
+from arm5dof.vision import commands as vision
 
 TRAIN_HELP = """\
 Train a policy that answers "which joint angles reach this point?".
@@ -202,6 +203,8 @@ def _parser() -> Parser:
     p.add_argument("--tolerance-mm", type=float, default=20.0, metavar="MM", help="what counts as reached; default 20")
     p.add_argument("--json", action="store_true", help="print a JSON list")
     p.set_defaults(run=solve)
+
+    vision.declare(commands.add_parser("vision", help="cameras: calibrate", description="What the arm sees."))
     return parser
 
 

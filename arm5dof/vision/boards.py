@@ -42,8 +42,9 @@ class Corners(NamedTuple):
 class Board(Protocol):
     """Something flat with corners at known places."""
 
-    turns: bool
-    """Whether it looks the same when turned by half a turn, so that its pose is ambiguous."""
+    @property
+    def turns(self) -> bool:
+        """Whether it looks the same when turned by half a turn, so that its pose is ambiguous."""
 
     def find(self, grey: np.ndarray) -> Corners | None:
         """The board's corners in a picture (h, w), uint8; None if it is not seen."""

@@ -85,7 +85,7 @@ def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str
     cannot be read or differ in size, if too few show the board, or if they show a larger one."""
     sizes: dict[str, tuple[int, int]] = {}
     found, without, notes = [], [], []
-    for i, (path, name) in enumerate(zip(paths, _names(paths), strict=True)):
+    for i, (path, name) in enumerate(zip(paths, names(paths), strict=True)):
         grey = _read_grey(path)
         sizes[name] = grey.shape[1], grey.shape[0]
         corners = board.find(grey)
@@ -122,9 +122,9 @@ def calibrate(views: Views, coefficients: int = 5) -> Calibration:
         kept, result = rest, without
         outliers.append(worst)
     if 4 * len(outliers) > len(views.found):
-        names = ", ".join(view.name for view in outliers)
+        listed = ", ".join(view.name for view in outliers)
         raise UserError(
-            f"{len(outliers)} of {len(views.found)} views do not fit the others ({names}): use "
+            f"{len(outliers)} of {len(views.found)} views do not fit the others ({listed}): use "
             "one camera, one zoom and focus, one resolution, and a board that is flat"
         )
     _check_different(kept, views.size)
@@ -196,13 +196,11 @@ def extrinsics(camera: Camera, path: Path, board: Board, board_to_base: np.ndarr
     return camera.with_pose(camera_to_base[:3, :3], camera_to_base[:3, 3])
 
 
-def preview(path: Path, camera: Camera) -> np.ndarray:
-    """A photograph as it is and, beside it, without its lens distortion: blue, green and red, (h, 2 w, 3), uint8."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise UserError(f"{path} is no image that can be read")
+def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
+    """A photograph as it is and, beside it, without its lens distortion, as an image file of the kind `suffix`."""
+    picture = _decode(path, cv2.IMREAD_COLOR)
     straight = cv2.undistort(picture, np.asarray(camera.matrix), np.asarray(camera.distortion))
-    return np.concatenate([picture, straight], axis=1)
+    return cv2.imencode(suffix, np.concatenate([picture, straight], axis=1))[1].tobytes()
 
 
 def _error(camera: Camera, corners: Corners) -> float:
@@ -265,7 +263,7 @@ def _one_size(sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
     return size
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
+def names(paths: Sequence[Path]) -> list[str]:
     """File names, with their folders where two are the same."""
     count = Counter(path.name for path in paths)
     return [path.name if count[path.name] == 1 else str(path) for path in paths]
@@ -273,8 +271,12 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _read_grey(path: Path) -> np.ndarray:
     """A photograph in grey, (h, w), uint8."""
+    return _decode(path, cv2.IMREAD_GRAYSCALE)
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    grey = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
-    if grey is None:
-        raise UserError(f"{path} is {'empty' if not content.size else 'no image that can be read'}: leave it out")
-    return grey
+    picture = cv2.imdecode(content, flags) if content.size else None
+    if picture is None:
+        raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
+    return picture
