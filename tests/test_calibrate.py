@@ -1,5 +1,6 @@
 """Calibration: OpenCV's photographs against OpenCV's published calibration, and boards drawn through known cameras."""
 
+import functools
 import json
 import subprocess
 import sys
@@ -155,18 +156,26 @@ TRUE = Camera(
 )
 
 
-def photograph(drawing, metres_per_pixel, origin, pose, camera=TRUE, oversampling=2):
-    """What a camera sees of a drawing whose pixel `origin` is the board's origin, at the board's pose (4, 4) in the
-    camera's frame, found by casting the pixels' rays."""
-    n = oversampling
-    u, v = np.meshgrid((np.arange(n * camera.width) + 0.5) / n - 0.5, (np.arange(n * camera.height) + 0.5) / n - 0.5)
-    pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(pixels, camera.matrix, camera.distortion)[:, 0]
+OVERSAMPLING = 2
+
+
+@functools.cache
+def rays():
+    """Where the true camera's pixels, and those between them, look on the plane at depth 1, (h, w, 2)."""
+    u, v = (np.arange(OVERSAMPLING * n) for n in (TRUE.width, TRUE.height))
+    pixels = (np.stack(np.meshgrid(u, v), -1) + 0.5) / OVERSAMPLING - 0.5
+    plane = cv2.undistortPoints(pixels.reshape(-1, 1, 2), TRUE.matrix, TRUE.distortion)
+    return plane.reshape(pixels.shape)
+
+
+def photograph(drawing, metres_per_pixel, origin, pose):
+    """What the true camera sees of a drawing whose pixel `origin` is the board's origin, at the board's pose (4, 4)
+    in the camera's frame."""
     homography = np.linalg.inv(np.c_[pose[:3, :2], pose[:3, 3]])
-    place = np.c_[rays, np.ones(len(rays))] @ homography.T
-    place = (place[:, :2] / place[:, 2:] / metres_per_pixel + origin).astype(np.float32).reshape(*u.shape, 2)
-    picture = cv2.remap(drawing, place, None, cv2.INTER_LINEAR, borderValue=200)
-    return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    place = rays() @ homography[:, :2].T + homography[:, 2]
+    place = (place[..., :2] / place[..., 2:] / metres_per_pixel + origin).astype(np.float32)
+    picture = cv2.remap(drawing, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=200)
+    return cv2.resize(picture, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
 
 
 def poses(rng, n, middle, distance=0.5):
