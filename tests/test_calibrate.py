@@ -110,6 +110,17 @@ def test_a_view_from_another_camera_is_named(zoom, photographs, views):
     assert result.rms < 0.2 and abs(result.intrinsics[0] - 532.3) < 1.5
 
 
+def test_two_cameras_half_and_half_are_refused(photographs, views):
+    """Neither half stands out, and together they fit to 0.7 pixels, with a focal length that is neither's."""
+    mixed, warp = list(views.found), np.array([[1.2, 0, -0.2 * 319.5], [0, 1.2, -0.2 * 239.5]])
+    for i in (1, 3, 6, 8, 10, 11):
+        grey = cv2.imread(str(photographs[i]), cv2.IMREAD_GRAYSCALE)
+        mixed[i] = View(f"other {i}", BOARD.find(cv2.warpAffine(grey, warp, (640, 480), borderValue=200)))
+    assert fit(mixed, views.size).rms < 0.8
+    with pytest.raises(UserError, match=r"the views do not fit one camera: .* times what they are one by one"):
+        calibrate(views._replace(found=mixed))
+
+
 def test_views_that_contradict_each_other_are_refused(views):
     stretched = [
         View(v.name, Corners(v.corners.points, v.corners.pixels * np.float32([1, 1 + 0.05 * (i % 5)])))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,6 +34,10 @@ a share of the picture's larger side."""
 OUTLIER = 3.0
 """A view whose error under the others' calibration is so many times their median is not of the same camera, or has
 wrong corners."""
+
+DISAGREEMENT = 2.5
+"""The error of all views together may be so many times what each leaves with intrinsics of its own: 1.2 times for
+OpenCV's photographs, four times where half of them are of another camera and so none stands out."""
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """What is estimated, in OpenCV's order: pixels, then distortion coefficients without a unit."""
@@ -128,14 +132,9 @@ def calibrate(views: Views, coefficients: int = 5) -> Calibration:
             "one camera, one zoom and focus, one resolution, and a board that is flat"
         )
     _check_different(kept, views.size)
+    _check_agreement(kept, result)
     _check_deviations(result)
-    return Calibration(
-        result.camera,
-        result.rms,
-        result.deviations,
-        result.errors,
-        {view.name: _error(result.camera, view.corners) for view in outliers},
-    )
+    return replace(result, outliers={view.name: _error(result.camera, view.corners) for view in outliers})
 
 
 def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, flags: int = 0) -> Calibration:
@@ -160,12 +159,10 @@ def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, fla
 
 def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
     """The board's pose in the camera's frame, (4, 4), from one photograph."""
-    matrix, distortion = np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
+    lens = _lens(camera)
     # A flat board has two poses that look alike; the first is the one with the smaller error.
-    _, turns, shifts, _ = cv2.solvePnPGeneric(
-        corners.points, corners.pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
-    )
-    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, matrix, distortion, turns[0], shifts[0])
+    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, corners.pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
+    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, *lens, turns[0], shifts[0])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     return pose
@@ -198,21 +195,20 @@ def extrinsics(camera: Camera, path: Path, board: Board, board_to_base: np.ndarr
 
 def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
     """A photograph as it is and, beside it, without its lens distortion, as an image file of the kind `suffix`."""
-    picture = _decode(path, cv2.IMREAD_COLOR)
-    straight = cv2.undistort(picture, np.asarray(camera.matrix), np.asarray(camera.distortion))
+    picture = _read_grey(path, cv2.IMREAD_COLOR)
+    straight = cv2.undistort(picture, *_lens(camera))
     return cv2.imencode(suffix, np.concatenate([picture, straight], axis=1))[1].tobytes()
+
+
+def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
 
 
 def _error(camera: Camera, corners: Corners) -> float:
     """Root mean square reprojection error of a view with the best pose, pixels."""
     pose = board_pose(camera, corners)
-    pixels, _ = cv2.projectPoints(
-        corners.points,
-        cv2.Rodrigues(pose[:3, :3])[0],
-        pose[:3, 3],
-        np.asarray(camera.matrix, float),
-        np.asarray(camera.distortion, float),
-    )
+    turn, _ = cv2.Rodrigues(pose[:3, :3])
+    pixels, _ = cv2.projectPoints(corners.points, turn, pose[:3, 3], *_lens(camera))
     return float(np.sqrt(np.square(pixels[:, 0] - corners.pixels).sum(-1).mean()))
 
 
@@ -238,6 +234,27 @@ def _apart(a: Corners, b: Corners) -> float:
         if (key := tuple(point)) in places
     ]
     return float(np.mean(apart)) if apart else np.inf
+
+
+def _check_agreement(views: Sequence[View], result: Calibration) -> None:
+    """Compare the error with that of views calibrated one by one, where they have corners enough for that."""
+    matrix, distortion = _lens(result.camera)
+    flags = COUNT_FLAGS[len(distortion)] | cv2.CALIB_USE_INTRINSIC_GUESS
+    together, alone = [], []
+    for name, (points, pixels) in views:
+        spare = (
+            1 - (10 + len(distortion)) / pixels.size
+        )  # Fitted are the pose, two focal lengths, the centre, the lens.
+        if spare > 0.5:
+            size = result.camera.width, result.camera.height
+            rms, *_ = cv2.calibrateCamera([points], [pixels], size, matrix.copy(), distortion.copy(), flags=flags)
+            together.append(result.errors[name])
+            alone.append(rms / np.sqrt(spare))
+    if together and (ratio := np.median(together) / np.median(alone)) > DISAGREEMENT:
+        raise UserError(
+            f"the views do not fit one camera: {np.median(together):.2f} pixels off together, {ratio:.1f} times what "
+            "they are one by one; use one camera, one zoom and focus, and a board that is flat"
+        )
 
 
 def _check_deviations(result: Calibration) -> None:
@@ -269,12 +286,8 @@ def names(paths: Sequence[Path]) -> list[str]:
     return [path.name if count[path.name] == 1 else str(path) for path in paths]
 
 
-def _read_grey(path: Path) -> np.ndarray:
-    """A photograph in grey, (h, w), uint8."""
-    return _decode(path, cv2.IMREAD_GRAYSCALE)
-
-
-def _decode(path: Path, flags: int) -> np.ndarray:
+def _read_grey(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> np.ndarray:
+    """A photograph in grey, (h, w), uint8; or as OpenCV's other `flags` have it."""
     content = np.frombuffer(path.read_bytes(), np.uint8)
     picture = cv2.imdecode(content, flags) if content.size else None
     if picture is None:
