@@ -259,6 +259,17 @@ def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
         extrinsics(wrong, path, board, board_to_base)
 
 
+@pytest.mark.parametrize("order", [np.s_[:, :], np.s_[::-1], np.s_[:, ::-1], np.s_[::-1, ::-1]], ids=str)
+def test_the_first_corner_is_told_by_the_colours(order, monkeypatch):
+    """In whatever order a detector gives them: the square before the first corner is black, the columns go down."""
+    board = Checkerboard(8, 5, 0.03)
+    picture, metres_per_pixel, origin = draw(board)
+    detect = Checkerboard._detect
+    monkeypatch.setattr(Checkerboard, "_detect", lambda self, grey: detect(self, grey)[order])
+    corners = board.find(picture)
+    np.testing.assert_allclose(corners.pixels, corners.points[:, :2] / metres_per_pixel + origin, atol=0.1)
+
+
 def test_charuco_boards_that_do_not_exist_or_are_another_size():
     for arguments, said in [
         ((8, 6, 0.03, 0.03), "do not fit into squares"),
