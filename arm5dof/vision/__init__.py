@@ -1,1 +1,1 @@
-"""What the arm sees: cameras, their calibration, and where in the base frame the things in a picture are."""
+"""What the camera sees, and where it is: images in; cameras, calibration and detections out."""

@@ -1,0 +1,119 @@
+"""Images: the one place where they enter, and the resizing that detectors want.
+
+Everywhere else an image is RGB, uint8, (h, w, 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from arm5dof.errors import UserError
+
+GREY = 114
+"""The borders of a letterboxed image, as YOLO networks were trained with."""
+
+
+def read(path: str | Path) -> np.ndarray:
+    """An image file as RGB uint8 (h, w, 3), turned upright if its EXIF data say so. Raises `UserError` if there is no
+    such file or it is no image."""
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"no image {path}: give the path of an image file")
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    try:
+        pixels = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if content.size else None
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise UserError(f"{path} is empty, damaged, or no image that OpenCV reads: give a JPEG or PNG file")
+    try:
+        return rgb(pixels[..., ::-1])
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+
+
+def rgb(array: np.ndarray) -> np.ndarray:
+    """An image as RGB uint8 (h, w, 3), from
+
+    - grey (h, w) or (h, w, 1): repeated three times
+    - RGBA (h, w, 4): without its alpha, whatever lies beneath
+    - uint16: divided by 257, which takes the whole range to the whole range, and rounded
+    - floating point in [0, 1]: times 255, rounded
+
+    Raises `UserError` for anything else; channels are never taken for BGR.
+    """
+    array = np.asarray(array)
+    if array.ndim == 2:
+        array = array[..., None]
+    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or 0 in array.shape:
+        raise UserError(f"an image has shape (h, w), (h, w, 1), (h, w, 3) or (h, w, 4) and is not empty: {array.shape}")
+    array = array[..., :3]
+    if array.dtype == np.uint16:
+        array = ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    elif np.issubdtype(array.dtype, np.floating):
+        if not np.isfinite(array).all():
+            raise UserError("the image holds values that are not finite (NaN or infinite): replace them")
+        if array.min() < 0 or array.max() > 1:
+            low, high = float(array.min()), float(array.max())
+            raise UserError(f"a floating-point image lies in [0, 1], this one in [{low:g}, {high:g}]: scale it")
+        array = np.round(array * 255).astype(np.uint8)
+    elif array.dtype != np.uint8:
+        raise UserError(f"an image is uint8, uint16 or floating point in [0, 1], not {array.dtype}: convert it")
+    return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:2], 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Letterbox:
+    """An image shrunk or enlarged to fit a network's input, and the way back to its own pixels.
+
+    Boxes are left, top, right, bottom (n, 4) in pixels, where pixel i covers [i, i + 1).
+    """
+
+    image: np.ndarray
+    """RGB uint8 (h, w, 3)."""
+    source: tuple[int, int]
+    """Width and height of the image that it was made from."""
+    inner: tuple[int, int]
+    """Width and height of that image inside this one."""
+    offset: tuple[int, int]
+    """Where it begins in this one: left, top."""
+
+    def from_source(self, xyxy: np.ndarray) -> np.ndarray:
+        """Boxes in the source image, where they are in this one."""
+        return np.asarray(xyxy, float) * np.tile(self._scale, 2) + np.tile(self.offset, 2)
+
+    def to_source(self, xyxy: np.ndarray) -> np.ndarray:
+        """Boxes in this image, where they are in the source, cut off at its edges."""
+        boxes = (np.asarray(xyxy, float) - np.tile(self.offset, 2)) / np.tile(self._scale, 2)
+        return np.clip(boxes, 0, np.tile(self.source, 2))
+
+    @property
+    def _scale(self) -> np.ndarray:
+        return np.array(self.inner) / np.array(self.source)
+
+
+def letterbox(image: np.ndarray, size: tuple[int, int], stride: int | None = None) -> Letterbox:
+    """Fit an RGB uint8 image into `size` (width, height), keeping its aspect, between grey borders.
+
+    With a `stride` the borders are only as wide as it takes to make width and height multiples of it, as YOLOv5 does:
+    fewer pixels to look at, and another input shape for each aspect. Without, they fill up to `size`.
+    """
+    height, width = image.shape[:2]
+    scale = min(size[0] / width, size[1] / height)
+    inner = (max(1, round(width * scale)), max(1, round(height * scale)))
+    full = size if stride is None else (-(-inner[0] // stride) * stride, -(-inner[1] // stride) * stride)
+    left, top = (full[0] - inner[0]) // 2, (full[1] - inner[1]) // 2
+    canvas = np.full((full[1], full[0], 3), GREY, np.uint8)
+    resized = image if inner == (width, height) else cv2.resize(image, inner, interpolation=cv2.INTER_LINEAR)
+    canvas[top : top + inner[1], left : left + inner[0]] = resized
+    return Letterbox(canvas, (width, height), inner, (left, top))
+
+
+def check_size(size: int, stride: int = 32) -> None:
+    """Raise `UserError` unless a network of that stride can take a square image of `size` pixels."""
+    if size < stride or size % stride:
+        raise UserError(f"the input size must be a positive multiple of {stride}, got {size}")
