@@ -1,4 +1,4 @@
-"""What all tests share: the compilation cache, the arm, and two environments."""
+"""What all tests share: the compilation cache, the arm, two environments, and real data."""
 
 from __future__ import annotations
 
@@ -52,3 +52,12 @@ def servo(arm: Arm) -> Reach:
     from arm5dof.envs import Reach, ReachConfig
 
     return Reach(arm, ReachConfig(dynamics="servo", observation="full"))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Photographs and weights that are not ours: from the folder that ARM5DOF_TEST_DATA names, or ../shared/data."""
+    folder = Path(os.environ.get("ARM5DOF_TEST_DATA") or Path(__file__).parents[2] / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no real data: no folder {folder} (set ARM5DOF_TEST_DATA)")
+    return folder

@@ -1,0 +1,110 @@
+"""What an ONNX file says of itself: the shapes of its inputs and its metadata.
+
+The file is one protobuf message. The few fields needed are read by their numbers in onnx.proto, without a library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from arm5dof.errors import UserError
+
+MODEL_GRAPH, MODEL_METADATA = 7, 14
+GRAPH_INITIALIZER, GRAPH_INPUT = 5, 11
+TENSOR_NAME = 8
+VALUE_NAME, VALUE_TYPE = 1, 2
+TYPE_TENSOR, TENSOR_SHAPE, SHAPE_DIM, DIM_VALUE = 1, 2, 1, 1
+ENTRY_KEY, ENTRY_VALUE = 1, 2
+
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+"""Protobuf's wire types."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """Of a network in an ONNX file."""
+
+    inputs: tuple[tuple[int | None, ...], ...]
+    """Shapes; None where the file leaves a length open."""
+    metadata: dict[str, str]
+
+
+def describe(path: Path) -> Description:
+    """Read an ONNX file's description. Raises `UserError` if there is no such file or it is damaged."""
+    if not path.is_file():
+        raise UserError(f"no file {path}: give an ONNX file")
+    try:
+        return _model(memoryview(path.read_bytes()))
+    except (ValueError, IndexError) as error:
+        raise UserError(f"{path} is not an ONNX file, or is damaged ({error}): export or download it again") from None
+
+
+def _model(message: memoryview) -> Description:
+    graphs = _all(message, MODEL_GRAPH)
+    if len(graphs) != 1:
+        raise ValueError("it holds no network")
+    constants = {_text(tensor, TENSOR_NAME) for tensor in _all(graphs[0], GRAPH_INITIALIZER)}
+    # Old files list their weights among the inputs too.
+    inputs = [v for v in _all(graphs[0], GRAPH_INPUT) if _text(v, VALUE_NAME) not in constants]
+    entries = _all(message, MODEL_METADATA)
+    return Description(
+        tuple(_shape(value) for value in inputs), {_text(e, ENTRY_KEY): _text(e, ENTRY_VALUE) for e in entries}
+    )
+
+
+def _shape(value: memoryview) -> tuple[int | None, ...]:
+    for number in (VALUE_TYPE, TYPE_TENSOR, TENSOR_SHAPE):
+        found = _all(value, number)
+        if len(found) != 1:
+            raise ValueError("an input is no tensor")
+        value = found[0]
+    lengths = [[n for number, n in _fields(dim) if number == DIM_VALUE] for dim in _all(value, SHAPE_DIM)]
+    return tuple(n[0] if n and isinstance(n[0], int) and n[0] > 0 else None for n in lengths)
+
+
+def _text(message: memoryview, number: int) -> str:
+    found = _all(message, number)
+    return bytes(found[0]).decode() if found else ""
+
+
+def _all(message: memoryview, number: int) -> list[memoryview]:
+    """Every field of that number that is bytes: a message or a text."""
+    return [value for n, value in _fields(message) if n == number and isinstance(value, memoryview)]
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Numbers and values of a message's fields."""
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        wire = key & 7
+        if wire == VARINT:
+            value, at = _varint(message, at)
+            yield key >> 3, value
+            continue
+        if wire == BYTES:
+            length, at = _varint(message, at)
+        elif wire in (FIXED32, FIXED64):
+            length = 4 if wire == FIXED32 else 8
+        else:
+            raise ValueError(f"byte {at} begins no field")
+        if at + length > len(message):
+            raise ValueError("it is cut short")
+        yield key >> 3, message[at : at + length]
+        at += length
+
+
+def _varint(message: memoryview, at: int) -> tuple[int, int]:
+    """A number in seven-bit pieces, and where it ends."""
+    value = 0
+    for shift in range(0, 70, 7):
+        if at >= len(message):
+            raise ValueError("it is cut short")
+        byte = message[at]
+        at += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, at
+    raise ValueError(f"byte {at} begins no number")
