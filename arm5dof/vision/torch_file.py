@@ -72,9 +72,10 @@ class Module(metaclass=_Inert):
     """Module and class, as in `models.common.Conv`."""
     _attributes: dict[str, Any]
 
-    def __init__(self, *arguments: object) -> None:
+    def __new__(cls, *arguments: object) -> Module:
         if arguments:
-            raise pickle.UnpicklingError(f"it calls {self.kind}")
+            raise pickle.UnpicklingError(f"it calls {cls.kind}")
+        return object.__new__(cls)
 
     def __setstate__(self, state: object) -> None:
         if type(state) is not dict or not all(type(key) is str for key in state):
