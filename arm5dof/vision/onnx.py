@@ -29,8 +29,9 @@ from arm5dof.vision.images import GREY, check_size, letterbox, rgb
 PYRAMIDS = ((8, 16, 32), (8, 16, 32, 64))
 """Strides of the scales that such networks look at."""
 
-ASTRAY = 8
-"""How far a box's centre may lie from the middle of its cell, in cells: YOLOv8's distances reach to 16 on each side."""
+ASTRAY = {"yolov5": 1.5, "yolov8": 8, "yolox": 8}
+"""How far a box's centre may lie from the middle of its cell, in cells. YOLOv5's cannot be further away than 1,
+YOLOv8's than 7.5; YOLOX sets no bound."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +64,10 @@ class _Layout:
                 boxes = np.concatenate([boxes[:, :2] * self.stride + corner, np.exp(boxes[:, 2:]) * self.stride], 1)
         return boxes, scores
 
-    def fits(self, output: np.ndarray) -> bool:
-        """Whether nearly all boxes stand at their cells."""
-        centre = self.decode(output)[0][:, :2]
-        return bool(np.mean(np.abs(centre - self.middle) <= ASTRAY * self.stride) > 0.95)
+    def astray(self, output: np.ndarray) -> float:
+        """How far from the middles of their cells the boxes are, in cells, but for the worst twentieth."""
+        away = np.abs(self.decode(output)[0][:, :2] - self.middle) / self.stride
+        return float(np.quantile(away.max(1), 0.95))
 
 
 class OnnxYOLO:
@@ -145,14 +146,14 @@ class OnnxYOLO:
                 "give one name for each class"
             )
         output = self._forward(layout.blob(grey))
-        if layout.name == "yolox" and not layout.fits(output):
-            layout = replace(layout, raw=True)
+        if layout.name == "yolox":
+            layout = min(layout, replace(layout, raw=True), key=lambda either: either.astray(output))
         boxes, scores = layout.decode(output)
         if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
             raise UserError(f"{self._path}: the network's output is not finite: its weights are damaged")
         if scores.min() < -1e-3 or scores.max() > 1 + 1e-3:
             raise UserError(f"{self._path}: scores outside [0, 1]: export the network with its last sigmoid")
-        if not layout.fits(output):
+        if layout.astray(output) > ASTRAY[layout.name]:
             raise UserError(
                 f"{self._path}: boxes far from their cells: the network was exported for another size than "
                 f"{self._size[0]} x {self._size[1]} pixels, or with its coordinates scaled"
