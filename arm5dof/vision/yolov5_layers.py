@@ -13,6 +13,16 @@ import jax.numpy as jnp
 from flax import struct
 
 
+def _convolve(x: jax.Array, weight: jax.Array, stride: tuple[int, int], padding: tuple[int, int]) -> jax.Array:
+    layout = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(x, weight, stride, [(p, p) for p in padding], dimension_numbers=layout)
+
+
+def _blocks(x: jax.Array) -> jax.Array:
+    """Blocks of 2 x 2 as channels: (2 height, 2 width, channels, ...) to (height, width, 4 channels, ...)."""
+    return jnp.concatenate([x[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=2)
+
+
 class Conv(struct.PyTreeNode):
     """Convolution, then SiLU where `activated`."""
 
@@ -26,10 +36,11 @@ class Conv(struct.PyTreeNode):
     def __call__(self, x: jax.Array) -> jax.Array:
         if self.weight.shape[:2] == (1, 1) == self.stride:
             x = x @ self.weight[0, 0]  # XLA's convolutions on a CPU do not see that this is all there is to it.
+        elif self.weight.shape[:2] == (6, 6) and (self.stride, self.padding) == ((2, 2), (2, 2)):
+            # The first layer, on three channels. The same sum over blocks of 2 x 2 pixels takes two thirds of its time.
+            x = _convolve(_blocks(x[0])[None], _blocks(self.weight), (1, 1), (1, 1))
         else:
-            padding = [(p, p) for p in self.padding]
-            layout = ("NHWC", "HWIO", "NHWC")
-            x = jax.lax.conv_general_dilated(x, self.weight, self.stride, padding, dimension_numbers=layout)
+            x = _convolve(x, self.weight, self.stride, self.padding)
         x = x + self.bias
         return jax.nn.silu(x) if self.activated else x
 
