@@ -9,6 +9,7 @@ else runs.
 
 from __future__ import annotations
 
+import os
 import statistics
 import sys
 import time
@@ -56,6 +57,7 @@ def main() -> None:
     vision = Path(sys.argv[1]) / "vision"
     image = read(vision / "photos" / "bus.jpg")
     rows, apart = [], []
+    load = os.getloadavg()[0]
     for size in SIZES:
         ours = YOLOv5(vision / "models" / "yolov5n.pt", size=size)
         theirs = OnnxYOLO(vision / "models" / "yolov5n_fp16.onnx", ours.class_names, size=size)
@@ -84,8 +86,9 @@ def main() -> None:
             "# YOLOv5n in JAX and in OpenCV",
             "",
             f"Frames a second, medians of {TURNS} turns taken one after the other; in brackets the middle 80 % of the",
-            f"turns' ratios. {jax.devices()[0].device_kind}, {cv2.getNumThreads()} threads for OpenCV; jax",
-            f"{jax.__version__}, OpenCV {cv2.__version__}. Command: `python experiments/yolo.py DATA`.",
+            f"turns' ratios. {os.cpu_count()} cores, load average {load:.1f} at the start (above 0, others worked too",
+            f"and only ratios count); jax {jax.__version__}, OpenCV {cv2.__version__}. Command:",
+            "`python experiments/yolo.py DATA`.",
             "",
             "| | OpenCV | JAX | JAX / OpenCV |",
             "| --- | ---: | ---: | ---: |",

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from arm5dof.errors import UserError
 from arm5dof.vision import images
@@ -26,6 +27,16 @@ def test_grey_alpha_and_sixteen_bits_from_files(tmp_path):
     np.testing.assert_array_equal(images.read(tmp_path / "grey.png"), np.dstack([grey] * 3))
     np.testing.assert_array_equal(images.read(tmp_path / "alpha.png"), alpha[..., 2::-1])
     np.testing.assert_array_equal(images.read(tmp_path / "deep.png"), np.dstack([grey] * 3))
+
+
+def test_photographs_are_turned_upright(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # Orientation: a quarter turn clockwise is due.
+    pixels = np.zeros((16, 32, 3), np.uint8)
+    pixels[:, :16] = 255
+    Image.fromarray(pixels).save(tmp_path / "turned.jpg", exif=exif)
+    image = images.read(tmp_path / "turned.jpg")
+    assert image.shape == (32, 16, 3) and image[:12].min() > 200 and image[20:].max() < 50
 
 
 def test_ranges_meet_at_both_ends_and_round():

@@ -100,6 +100,7 @@ def attacks(command):
     yield "extension", Raw(b"\x82\x01")
     yield "memo of terabytes", Raw(b"Nr\xff\xff\xff\x7f")
     yield "text of gigabytes", Raw(b"X\xff\xff\xff\x7fabc")
+    yield "tuples a million deep as a key", Raw(b"}N" + b"\x85" * 10**6 + b"Ns")
     yield "other persistent object", Raw(Writer().write(("module", Raw(conv), "0", "cpu", 1)) + b"Q")
     yield "path as a key", Raw(Writer().write(("storage", named("torch", "FloatStorage"), "../x", "cpu", 1)) + b"Q")
     yield "missing storage", Raw(Writer().write(("storage", named("torch", "FloatStorage"), "9", "cpu", 1)) + b"Q")

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib import metadata
 
 import pytest
 
@@ -30,3 +31,15 @@ def test_jax_starts_with_what_was_set(own):
     environment = {**os.environ, "XLA_FLAGS": own}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert ("=true" in done.stdout) == bool(own)
+
+
+def test_one_program_may_choose_for_itself():
+    code = (
+        "import arm5dof, jax, jax.numpy as jnp; from arm5dof import xla;"
+        "print(xla.fusion_emitters(), jax.jit(jnp.sin, compiler_options=xla.fusion_emitters())(0.0))"
+    )
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == "0.0"
+    known = xla.flags("", metadata.version("jaxlib")) != ""
+    assert ("True" in done.stdout) == known

@@ -11,6 +11,7 @@ from arm5dof.errors import UserError
 from arm5dof.vision.images import letterbox, read
 from arm5dof.vision.onnx import OnnxYOLO
 from arm5dof.vision.yolov5 import YOLOv5
+from arm5dof.vision.yolov5_layers import Conv
 
 SIZE = 64
 STRIDES = (8, 16, 32)
@@ -109,6 +110,20 @@ def test_normalisation_folded_by_us_and_in_the_file_agree(tmp_path):
     assert np.ptp(np.asarray(ours[1])) > 0.01
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("size, stride, padding", [(6, 2, 2), (1, 1, 0), (3, 1, 1), (3, 2, 1), (1, 2, 0)])
+def test_every_way_to_convolve_is_the_same_sum(size, stride, padding):
+    random = np.random.default_rng(0)
+    x, weight = random.normal(size=(1, 8, 12, 3)), random.normal(size=(size, size, 3, 5))
+    bias = random.normal(size=5)
+    padded = np.pad(x[0], ((padding, padding), (padding, padding), (0, 0)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), (0, 1))[::stride, ::stride]
+    expected = np.einsum("hwcij,ijco->hwo", windows, weight) + bias
+    conv = Conv(np.float32(weight), np.float32(bias), (stride, stride), (padding, padding), activated=False)
+    np.testing.assert_allclose(conv(np.float32(x))[0], expected, rtol=1e-4, atol=1e-4)
+    active = conv.replace(activated=True)(np.float32(x))[0]
+    np.testing.assert_allclose(active, expected / (1 + np.exp(-expected)), rtol=1e-4, atol=1e-4)
 
 
 def test_files_of_other_networks_are_refused(tmp_path):

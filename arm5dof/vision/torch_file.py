@@ -30,6 +30,9 @@ OPCODES = frozenset(
 MAX_PICKLE = 64 * 2**20
 """Bytes of `data.pkl`; that of the largest YOLOv5 is below one megabyte."""
 
+MAX_TUPLES = 50_000
+"""Tuples in it; YOLOv5n has 2,000. A million, one inside another, would overflow the interpreter's stack."""
+
 DTYPES = {
     "DoubleStorage": np.float64,
     "FloatStorage": np.float32,
@@ -239,9 +242,13 @@ def _shell(module: str, name: str) -> type:
 
 def _check_opcodes(text: bytes) -> None:
     """Only what PyTorch writes; and memo slots no higher than the pickle is long, for the unpickler allocates them."""
+    tuples = 0
     for opcode, argument, _ in pickletools.genops(text):
         if opcode.name not in OPCODES or (opcode.name == "LONG_BINPUT" and (argument or 0) > len(text)):
             raise pickle.UnpicklingError(f"its pickle holds {opcode.name}, which PyTorch does not write")
+        tuples += opcode.name.startswith("TUPLE")
+    if tuples > MAX_TUPLES:
+        raise pickle.UnpicklingError(f"its pickle holds {tuples} tuples, more than any network needs")
 
 
 def _is_size(value: object) -> bool:
@@ -249,7 +256,8 @@ def _is_size(value: object) -> bool:
 
 
 def _view(storage: Any, offset: Any, size: Any, stride: Any) -> np.ndarray:
-    """A tensor's numbers, checked to lie inside its storage; a copy, so that it is contiguous."""
+    """A tensor's numbers, checked to lie inside its storage. A view that cannot be written to: copies of one
+    storage could be asked for without end."""
     if not isinstance(storage, _Storage) or type(size) is not tuple or type(stride) is not tuple:
         raise pickle.UnpicklingError("a tensor is malformed")
     if len(size) != len(stride) or len(size) > 8 or not all(map(_is_size, (offset, *size, *stride))):
@@ -259,4 +267,4 @@ def _view(storage: Any, offset: Any, size: Any, stride: Any) -> np.ndarray:
     if math.prod(size) > len(numbers) or (math.prod(size) and last >= len(numbers)):
         raise pickle.UnpicklingError("a tensor reaches beyond its storage")
     steps = [step * numbers.itemsize for step in stride]
-    return np.lib.stride_tricks.as_strided(numbers[offset:], size, steps, writeable=False).copy()
+    return np.lib.stride_tricks.as_strided(numbers[offset:], size, steps, writeable=False)
