@@ -146,11 +146,11 @@ class OnnxYOLO:
                 "give one name for each class"
             )
         output = self._forward(layout.blob(grey))
+        if not np.isfinite(output).all():
+            raise UserError(f"{self._path}: the network's output is not finite: its weights are damaged")
         if layout.name == "yolox":
             layout = min(layout, replace(layout, raw=True), key=lambda either: either.astray(output))
-        boxes, scores = layout.decode(output)
-        if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
-            raise UserError(f"{self._path}: the network's output is not finite: its weights are damaged")
+        scores = layout.decode(output)[1]
         if scores.min() < -1e-3 or scores.max() > 1 + 1e-3:
             raise UserError(f"{self._path}: scores outside [0, 1]: export the network with its last sigmoid")
         if layout.astray(output) > ASTRAY[layout.name]:
