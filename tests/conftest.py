@@ -24,7 +24,7 @@ settings.load_profile("arm5dof")
 
 @pytest.fixture(scope="session")
 def test_data() -> Path:
-    """The folder of real data that is no part of the project: photographs and published calibrations."""
+    """The folder of real data that is no part of the project: photographs, calibrations, weights."""
     folder = Path(os.environ.get("ARM5DOF_TEST_DATA") or Path(__file__).parent.parent.parent / "shared" / "data")
     if not folder.is_dir():
         pytest.skip(f"no test data in {folder}: name the folder in ARM5DOF_TEST_DATA")
@@ -52,12 +52,3 @@ def servo(arm: Arm) -> Reach:
     from arm5dof.envs import Reach, ReachConfig
 
     return Reach(arm, ReachConfig(dynamics="servo", observation="full"))
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Photographs and weights that are not ours: from the folder that ARM5DOF_TEST_DATA names, or ../shared/data."""
-    folder = Path(os.environ.get("ARM5DOF_TEST_DATA") or Path(__file__).parents[2] / "shared" / "data")
-    if not folder.is_dir():
-        pytest.skip(f"no real data: no folder {folder} (set ARM5DOF_TEST_DATA)")
-    return folder

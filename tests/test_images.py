@@ -44,8 +44,8 @@ def test_ranges_meet_at_both_ends_and_round():
     np.testing.assert_array_equal(images.rgb(np.array([[0, 0.5, 1.0]]))[..., 0], [[0, 128, 255]])
 
 
-def test_a_photograph(shared_data):
-    image = images.read(shared_data / "vision" / "photos" / "bus.jpg")
+def test_a_photograph(test_data):
+    image = images.read(test_data / "vision" / "photos" / "bus.jpg")
     assert image.shape == (1080, 810, 3) and image.dtype == np.uint8 and image.flags.c_contiguous
 
 

@@ -49,8 +49,8 @@ def test_modules_are_shells(tmp_path):
     assert "models" not in sys.modules and "torch" not in sys.modules
 
 
-def test_the_published_weights(shared_data):
-    saved = torch_file.load(shared_data / "vision" / "models" / "yolov5n.pt")
+def test_the_published_weights(test_data):
+    saved = torch_file.load(test_data / "vision" / "models" / "yolov5n.pt")
     model = saved["model"]
     assert model.kind == "models.yolo.Model" and len(model.get("names")) == 80
     first = model.get("model").children()[0].get("conv").get("weight")

@@ -23,13 +23,13 @@ NAMES = ("cube", "ball")
 
 
 @pytest.fixture(scope="session")
-def models(shared_data):
-    return shared_data / "vision" / "models"
+def models(test_data):
+    return test_data / "vision" / "models"
 
 
 @pytest.fixture(scope="session")
-def bus(shared_data):
-    return read(shared_data / "vision" / "photos" / "bus.jpg")
+def bus(test_data):
+    return read(test_data / "vision" / "photos" / "bus.jpg")
 
 
 @pytest.fixture(scope="session")
