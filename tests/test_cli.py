@@ -347,7 +347,9 @@ def test_interrupt_is_no_traceback(tmp_path):
         "--out",
         str(tmp_path / "run"),
     ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
+    # Where the tests run in the background, Ctrl-C is ignored, and children inherit that.
+    listen = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ, preexec_fn=listen)
     metrics = tmp_path / "run" / "metrics.csv"
     while not (metrics.exists() and metrics.stat().st_size):  # The first epoch is over, so nothing compiles any more.
         assert process.poll() is None
