@@ -87,24 +87,29 @@ class Arm:
 
     def forward(self, q: jax.Array) -> jax.Array:
         """Position of the end-effector site, (..., 3), at joint positions `q` (..., dof). Differentiable."""
-        return self._carry(q, self.dof)
+        return self._carry(self._motions(q), self.dof)
 
     def joint_positions(self, q: jax.Array) -> jax.Array:
         """Where the joints are, (..., dof, 3), at joint positions `q` (..., dof); a slide's joint is where it slides
         from."""
-        return jnp.stack([self._carry(q, k) for k in range(self.dof)], axis=-2)
+        motions = self._motions(q)
+        return jnp.stack([self._carry(motions, k) for k in range(self.dof)], axis=-2)
 
-    def _carry(self, q: jax.Array, joints: int) -> jax.Array:
+    def _motions(self, q: jax.Array) -> list[list[jax.Array]]:
+        """Positions (...) of the joints one by one, their cosines and their sines."""
+        # The gradient of a split is one concatenation, that of indexing a sum of padded arrays.
+        split = lambda x: [v[..., 0] for v in jax.lax.split(x, (1,) * self.dof, axis=x.ndim - 1)]
+        return [split(x) for x in (q, *_cos_sin(q))]
+
+    def _carry(self, motions: list[list[jax.Array]], joints: int) -> jax.Array:
         """The point behind the first so many joints, (..., 3).
 
         The same function of the same MJCF as `mjx.kinematics`, carried out on one point alone, from tip to base and
         component by component: the critic calls it in every update, where carrying every body along is wasted, and
         `mjx.kinematics` takes seconds to compile.
         """
-        x, y, z = (jnp.full(q.shape[:-1], c, q.dtype) for c in self.chain[joints].offset)
-        # The gradient of a split is one concatenation, that of indexing a sum of padded arrays.
-        split = lambda x: [v[..., 0] for v in jax.lax.split(x, (1,) * self.dof, axis=x.ndim - 1)]
-        values, cosines, sines = map(split, (q, *_cos_sin(q)))
+        values, cosines, sines = motions
+        x, y, z = (jnp.full_like(values[0], c) for c in self.chain[joints].offset)
         for k in reversed(range(joints)):
             link = self.chain[k]
             if link.slides:
