@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision import images
 from arm5dof.vision.boards import Board, Corners
 from arm5dof.vision.camera import Camera
 
@@ -195,7 +196,7 @@ def extrinsics(camera: Camera, path: Path, board: Board, board_to_base: np.ndarr
 
 def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
     """A photograph as it is and, beside it, without its lens distortion, as an image file of the kind `suffix`."""
-    picture = _read_grey(path, cv2.IMREAD_COLOR)
+    picture = cv2.cvtColor(images.read(path), cv2.COLOR_RGB2BGR)
     straight = cv2.undistort(picture, *_lens(camera))
     return cv2.imencode(suffix, np.concatenate([picture, straight], axis=1))[1].tobytes()
 
@@ -286,10 +287,10 @@ def names(paths: Sequence[Path]) -> list[str]:
     return [path.name if count[path.name] == 1 else str(path) for path in paths]
 
 
-def _read_grey(path: Path, flags: int = cv2.IMREAD_GRAYSCALE) -> np.ndarray:
-    """A photograph in grey, (h, w), uint8; or as OpenCV's other `flags` have it."""
+def _read_grey(path: Path) -> np.ndarray:
+    """A photograph in grey, (h, w), uint8."""
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(content, flags) if content.size else None
+    picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
     if picture is None:
         raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
     return picture
