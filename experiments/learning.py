@@ -43,6 +43,7 @@ ABLATIONS = {
     "no random actions": f"{BASE} --random 0",
     "no relabelling in hindsight": f"{BASE} --relabel 0",
     "all goals relabelled": f"{BASE} --relabel 1",
+    "critic without focus": f"{BASE} --critic-focus 0",
     "scalar critic": f"{BASE} --critic-form scalar",
     "scalar critic of width 128, depth 3": f"{BASE} --critic-form scalar --critic-width 128 --critic-depth 3",
     "state critic": f"{BASE} {STATE}",

@@ -101,7 +101,8 @@ def update() -> dict[str, float]:
     training = jax.jit(agent.init)(config, jax.random.key(0))
     training = jax.jit(lambda t: agent.collect(config, t)[0])(training)
     batches = training.replay.sample(jax.random.key(1), (count, config.batch_size))
-    scan = lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, b), t, b)[0].networks
+    batches = (batches, agent.views(config, batches))
+    scan = lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, *b), t, b)[0].networks
     learn = jax.jit(scan, compiler_options=xla.effort(2))
 
     rows, heads = config.batch_size, config.heads
@@ -161,9 +162,14 @@ def profile() -> dict[str, float]:
     shape = (ddpg.updates_per_step, ddpg.batch_size)
     key = jax.random.key(0)
     collect = jit(agent.collect)
-    draw = jit(lambda t: agent.relabel(ddpg, t.replay, t.replay.sample(key, shape), key))
+
+    def draw(t):
+        batches = agent.relabel(ddpg, t.replay, t.replay.sample(key, shape), key)
+        return batches, agent.views(ddpg, batches)
+
+    draw = jit(draw)
     batches = draw(state)
-    learn = jit(lambda t, b: jax.lax.scan(lambda t, b: agent.update(ddpg, t, b), t, b))
+    learn = jit(lambda t, b: jax.lax.scan(lambda t, b: agent.update(ddpg, t, *b), t, b))
     epoch = jit(agent.epoch, static_argnums=2)
     steps = trainer.config.train.epoch_steps
     parts = {

@@ -26,6 +26,7 @@ SMALL = DDPGConfig(
     heads=1,
     critic_view="state",
     critic_form="scalar",
+    critic_focus=0.0,
     random=0.0,
     batch_size=64,
     updates_per_step=8,
@@ -176,6 +177,12 @@ def test_critic_loss_is_eq_4():
     assert (jax.grad(losses.critic_loss, argnums=1)(jnp.array(q), jnp.array(target), jnp.ones(50)) == 0).all()
 
 
+def test_errors_count_less_where_values_are_large():
+    q, target = np.random.default_rng(0).normal(size=(2, 50))
+    loss = losses.critic_loss(jnp.array(q), jnp.array(target), jnp.ones(50), 10.0)
+    assert loss == pytest.approx(np.mean((target - q) ** 2 * 0.1 / (0.1 + np.abs(target))), rel=1e-5)
+
+
 def test_actor_loss_is_eq_5():
     q = np.random.default_rng(0).normal(size=(50, 1))
     weight = np.arange(50) % 3 > 0
@@ -219,8 +226,8 @@ class Bench(NamedTuple):
     batch: Transition
 
     def update(self, batch: Transition | None = None, **changes: Any) -> tuple[Training, dict[str, jax.Array]]:
-        config = replace(self.config, **changes)
-        return jax.jit(self.agent.update)(config, self.training, self.batch if batch is None else batch)
+        config, batch = replace(self.config, **changes), self.batch if batch is None else batch
+        return jax.jit(self.agent.update)(config, self.training, batch, self.agent.views(config, batch))
 
 
 @pytest.fixture(scope="module", params=[1, 3], ids=["one head", "three heads"])

@@ -6,6 +6,7 @@ together under one `jax.vmap` of `init` and `epoch`.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import jax
@@ -58,6 +59,9 @@ class DDPGConfig:
     """How sharply heads divide the targets among them, in units of reward (metres)."""
     heads: Count = static(default=8)
     """Candidate answers of the actor, among which the critic chooses. 1 is plain DDPG."""
+    critic_focus: Annotated[float, Ge(0)] = 10.0
+    """An error of the critic at a target value v counts 1 / (1 + critic_focus |v|) times; 1 / units of reward (metres).
+    The actor learns the last millimetres from values near a goal. 0: all count alike."""
     critic_view: Literal["outcome", "state"] = static(default="outcome")
     """outcome: the critic sees where the action leads by the arm's forward model, as the paper's does; state: it
     sees the observation and the action."""
@@ -156,6 +160,13 @@ class DDPG:
             return self.goal_env.outcome(obs, action)
         return jnp.concatenate([obs["privileged_state"], action])
 
+    def views(self, config: DDPGConfig, batch: Transition) -> jax.Array:
+        """What the critic sees of transitions with any leading axes."""
+        view = partial(self.view, config)
+        for _ in batch.reward.shape:
+            view = jax.vmap(view)
+        return view(batch.obs, batch.action)
+
     def candidates(self, actor: Params, obs: Observation) -> jax.Array:
         """The actor's candidate actions for a batch of observations, (batch, heads, action_size)."""
         return jnp.asarray(self.actor.apply(actor, obs["state"]))
@@ -227,7 +238,8 @@ class DDPG:
         key, sample_key, relabel_key = jax.random.split(training.key, 3)
         shape = (config.updates_per_step, config.batch_size)
         batches = self.relabel(config, training.replay, training.replay.sample(sample_key, shape), relabel_key)
-        training, metrics = jax.lax.scan(lambda t, batch: self.update(config, t, batch), training, batches)
+        views = self.views(config, batches)
+        training, metrics = jax.lax.scan(lambda t, x: self.update(config, t, *x), training, (batches, views))
         return training.replace(key=key), jax.tree.map(jnp.mean, metrics)
 
     def relabel(self, config: DDPGConfig, replay: Replay, batch: Transition, key: jax.Array) -> Transition:
@@ -254,16 +266,19 @@ class DDPG:
             one = jax.vmap(one)
         return one(batch, donors, chosen)
 
-    def update(self, config: DDPGConfig, training: Training, batch: Transition) -> tuple[Training, Metrics]:
-        """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau."""
+    def update(
+        self, config: DDPGConfig, training: Training, batch: Transition, view: jax.Array
+    ) -> tuple[Training, Metrics]:
+        """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau. `view` is what the
+        critic sees of the batch's observations and actions, (batch, view)."""
         networks = training.networks
         target = batch.reward + jax.lax.cond(
             config.discount > 0, lambda: self._bootstrap(config, networks, batch), lambda: jnp.zeros_like(batch.reward)
         )
 
         def critic_loss(critic: Params) -> tuple[jax.Array, jax.Array]:
-            q = self.value(config, critic, batch.obs, batch.action[:, None])[:, 0]
-            return losses.critic_loss(q, target, batch.weight), q.mean()
+            q = jnp.asarray(self.critic.apply(critic, view))
+            return losses.critic_loss(q, target, batch.weight, config.critic_focus), q.mean()
 
         def actor_loss(actor: Params) -> jax.Array:
             q = self.value(config, critic, batch.obs, self.candidates(actor, batch.obs))

@@ -6,9 +6,13 @@ import jax
 import jax.numpy as jnp
 
 
-def critic_loss(q: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
-    """Eq. 4: mean of [R + gamma Q'(s', mu'(s')) - Q(s, a)]^2; `target` is the part before the minus. All (batch,)."""
-    return _mean((jax.lax.stop_gradient(target) - q) ** 2, weight)
+def critic_loss(q: jax.Array, target: jax.Array, weight: jax.Array, focus: jax.Array | float = 0.0) -> jax.Array:
+    """Eq. 4: mean of [R + gamma Q'(s', mu'(s')) - Q(s, a)]^2; `target` is the part before the minus. All (batch,).
+
+    An error counts 1 / (1 + focus |target|) times.
+    """
+    target = jax.lax.stop_gradient(target)
+    return _mean((target - q) ** 2 / (1 + focus * jnp.abs(target)), weight)
 
 
 def actor_loss(q: jax.Array, weight: jax.Array, temperature: jax.Array | float) -> jax.Array:
