@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision.opencv import quiet
 
 GREY = 114
 """The borders of a letterboxed image, as YOLO networks were trained with."""
@@ -25,7 +26,8 @@ def read(path: str | Path) -> np.ndarray:
         raise UserError(f"no image {path}: give the path of an image file")
     content = np.frombuffer(path.read_bytes(), np.uint8)
     try:
-        pixels = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if content.size else None
+        with quiet():
+            pixels = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if content.size else None
     except cv2.error:
         pixels = None
     if pixels is None:

@@ -13,8 +13,7 @@ once when it is loaded: its boxes must stand at their cells.
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from arm5dof.errors import UserError
 from arm5dof.vision import onnx_file
 from arm5dof.vision.detections import Detections, check_thresholds, suppress
 from arm5dof.vision.images import GREY, check_size, letterbox, rgb
+from arm5dof.vision.opencv import quiet
 
 PYRAMIDS = ((8, 16, 32), (8, 16, 32, 64))
 """Strides of the scales that such networks look at."""
@@ -95,7 +95,7 @@ class OnnxYOLO:
         self._class_names = _names(self._path, class_names, description.metadata)
         self._size = _input_size(self._path, description, size)
         try:
-            with _quiet():
+            with quiet():
                 self._network = cv2.dnn.readNetFromONNX(str(self._path))
                 self._outputs = self._network.getUnconnectedOutLayersNames()
         except cv2.error as error:
@@ -116,7 +116,7 @@ class OnnxYOLO:
     def _forward(self, blob: np.ndarray) -> np.ndarray:
         """The one output of three dimensions; exports may carry feature maps beside it."""
         try:
-            with _quiet():
+            with quiet():
                 self._network.setInput(blob)
                 outputs = [np.asarray(x) for x in self._network.forward(self._outputs)]
         except cv2.error as error:
@@ -203,7 +203,7 @@ def _names(path: Path, given: Sequence[str] | None, metadata: dict[str, str]) ->
     if given is not None:
         return tuple(given)
     if "names" not in metadata:
-        raise UserError(f"{path} does not say what its classes are called: give class_names")
+        raise UserError(f"{path} does not say what its classes are called: give class_names (--names FILE)")
     try:
         names = ast.literal_eval(metadata["names"])
         if isinstance(names, dict):
@@ -211,21 +211,12 @@ def _names(path: Path, given: Sequence[str] | None, metadata: dict[str, str]) ->
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError
     except (ValueError, SyntaxError, TypeError, KeyError, RecursionError, MemoryError):
-        raise UserError(f"{path}: the class names in the file cannot be read: give class_names") from None
+        raise UserError(
+            f"{path}: the class names in the file cannot be read: give class_names (--names FILE)"
+        ) from None
     return tuple(names)
 
 
 def _reason(error: cv2.error) -> str:
     """OpenCV's own words, without its version, source file and line."""
     return (error.err or str(error)).strip().splitlines()[0][:200]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without OpenCV's warnings, which come by the dozen for each frame; what they warn of is checked here."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
