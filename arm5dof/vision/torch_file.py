@@ -237,6 +237,8 @@ def _shell(module: str, name: str) -> type:
         return _Inert(name, (_Ignored,), {})
     if module.startswith(MODULES) and name.isidentifier():
         return _Inert(name, (Module,), {"kind": f"{module}.{name}"})
+    if module.startswith("ultralytics."):
+        raise pickle.UnpicklingError("it is YOLOv8 or later, of which only ONNX is read: export it as that")
     raise pickle.UnpicklingError(f"it names {module}.{name}, which a file of weights has no need of")
 
 

@@ -6,7 +6,7 @@ Decoding and suppression are the published ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -124,19 +124,32 @@ def _program() -> Callable[[Network, np.ndarray], tuple[jax.Array, jax.Array]]:
 class YOLOv5:
     """A detector with the weights of a YOLOv5 v6 `.pt` file.
 
-    path:       the file
-    confidence: detections below are dropped
-    iou:        of boxes of one class that overlap more, the best stays
-    size:       longer side of the network's input, pixels; a multiple of the largest stride, 32 or 64
-    square:     a square input whatever the image, one program for all; without it the shorter side is only as long
-                as the image needs, one program for each aspect, and 4:3 images take three quarters of the time
+    path:        the file
+    class_names: names of the network's classes; without them, those in the file
+    confidence:  detections below are dropped
+    iou:         of boxes of one class that overlap more, the best stays
+    size:        longer side of the network's input, pixels; a multiple of the largest stride, 32 or 64
+    square:      a square input whatever the image, one program for all; without it the shorter side is only as long
+                 as the image needs, one program for each aspect, and 4:3 images take three quarters of the time
     """
 
     def __init__(
-        self, path: str | Path, confidence: float = 0.25, iou: float = 0.45, size: int = 640, square: bool = True
+        self,
+        path: str | Path,
+        class_names: Sequence[str] | None = None,
+        confidence: float = 0.25,
+        iou: float = 0.45,
+        size: int = 640,
+        square: bool = True,
     ) -> None:
         check_thresholds(confidence, iou)
-        self._network, self._class_names = build(path)
+        self._network, names = build(path)
+        if class_names is not None and len(class_names) != len(names):
+            raise UserError(
+                f"{path} tells {len(names)} classes apart, and {len(class_names)} names were given: give one name for "
+                "each class"
+            )
+        self._class_names = names if class_names is None else tuple(class_names)
         self._stride = max(self._network.layers[-1].strides)
         check_size(size, self._stride)
         self._confidence, self._iou, self._size, self._square = confidence, iou, size, square
