@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -61,28 +61,27 @@ class Detections:
         """Middles of the boxes, (n, 2), as OpenCV's camera model counts: whole numbers are the middles of pixels."""
         return (self.xyxy[:, :2] + self.xyxy[:, 2:]) / 2 - 0.5
 
-    def named(self, name: str) -> Detections:
-        """The boxes of one class. Raises `UserError` if the detector knows none of that name."""
-        if name not in self.class_names:
-            known = ", ".join(self.class_names[:20]) + (", ..." if len(self.class_names) > 20 else "")
-            raise UserError(f"the detector knows no class {name!r}; it knows: {known}")
-        return self[self.data["class_name"] == name]
+    def named(self, *names: str) -> Detections:
+        """The boxes of one class or several. Raises `UserError` if the detector knows none of such a name."""
+        check_known(names, self.class_names)
+        return self[np.isin(self.data["class_name"], names)]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """For each box its class, class id, confidence and edges in pixels, as JSON has them."""
+        each = zip(self.data["class_name"], self.class_id, self.confidence, self.xyxy, strict=True)
+        return [
+            {
+                "class_name": str(name),
+                "class_id": int(i),
+                "confidence": round(float(c), 4),
+                "xyxy": [round(float(v), 2) for v in box],
+            }
+            for name, i, c, box in each
+        ]
 
     def to_json(self) -> str:
-        """A list of objects with class, class id, confidence and box, in pixels."""
-        rows = zip(self.data["class_name"], self.class_id, self.confidence, self.xyxy, strict=True)
-        return json.dumps(
-            [
-                {
-                    "class_name": str(name),
-                    "class_id": int(i),
-                    "confidence": round(float(c), 4),
-                    "xyxy": [round(float(v), 2) for v in box],
-                }
-                for name, i, c, box in rows
-            ],
-            indent=2,
-        )
+        """`rows` as text."""
+        return json.dumps(self.rows(), indent=2)
 
 
 class Detector(Protocol):
@@ -93,6 +92,14 @@ class Detector(Protocol):
 
     def __call__(self, image: np.ndarray) -> Detections:
         """Detections in an RGB uint8 image (h, w, 3)."""
+
+
+def check_known(names: Iterable[str], class_names: Sequence[str]) -> None:
+    """Raise `UserError` unless all `names` are among a detector's."""
+    for name in names:
+        if name not in class_names:
+            known = ", ".join(class_names[:20]) + (", ..." if len(class_names) > 20 else "")
+            raise UserError(f"the detector knows no class {name!r}; it knows: {known}")
 
 
 def check_thresholds(confidence: float, iou: float) -> None:
@@ -125,27 +132,3 @@ def suppress(
         cv2.dnn.NMSBoxesBatched(whole.tolist(), score.tolist(), best.tolist(), 0.0, iou) if len(kept) else (), int
     )[:limit]
     return Detections(np.concatenate([corner, far], axis=1)[chosen], score[chosen], best[chosen], class_names)
-
-
-def annotate(image: np.ndarray, detections: Detections) -> np.ndarray:
-    """A copy of an RGB uint8 image (h, w, 3) with the boxes drawn in and named."""
-    image = np.ascontiguousarray(image).copy()
-    thickness = max(1, round(max(image.shape[:2]) / 400))
-    for box, name, i, confidence in zip(
-        detections.xyxy, detections.data["class_name"], detections.class_id, detections.confidence, strict=True
-    ):
-        colour = _colour(int(i))
-        left, top, right, bottom = (int(v) for v in np.round(box))
-        cv2.rectangle(image, (left, top), (right - 1, bottom - 1), colour, thickness)
-        text, font, scale = f"{name} {confidence:.2f}", cv2.FONT_HERSHEY_SIMPLEX, thickness / 4
-        (width, height), below = cv2.getTextSize(text, font, scale, thickness)
-        base = max(top, height + below)
-        cv2.rectangle(image, (left, base - height - below), (left + width, base), colour, cv2.FILLED)
-        cv2.putText(image, text, (left, base - below), font, scale, (255, 255, 255), thickness, cv2.LINE_AA)
-    return image
-
-
-def _colour(class_id: int) -> tuple[int, ...]:
-    """Neighbouring classes get hues far apart: steps of the golden angle."""
-    hue = int(class_id * 0.618034 % 1 * 180)
-    return tuple(int(v) for v in cv2.cvtColor(np.array([[[hue, 200, 160]]], np.uint8), cv2.COLOR_HSV2RGB)[0, 0])
