@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         place = f": {error.filename}" if error.filename else ""
         print(f"arm5dof: {error.strerror or error}{place}; what was complete is kept", file=sys.stderr)
     except KeyboardInterrupt:
-        print("arm5dof: interrupted; go on with arm5dof train --resume RUN", file=sys.stderr)
+        print("arm5dof: interrupted; a training goes on with arm5dof train --resume RUN", file=sys.stderr)
         return 130
     return 2
 

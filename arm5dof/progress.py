@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 LINE_EVERY_S = 10.0
 
 
 class Bar:
-    """A progress bar on stderr with a note beside it; where stderr is no terminal, a line every ten seconds."""
+    """A progress bar on stderr with rate, ETA and a note; where stderr is no terminal, a line every ten seconds.
 
-    def __init__(self, what: str, total: int, unit: str, done: int = 0) -> None:
+    `total` is None where nobody knows it: then there is no ETA.
+    """
+
+    def __init__(self, what: str, total: int | None, unit: str, done: int = 0) -> None:
         self.what, self.total, self.unit, self.done = what, total, unit, done
         self._first, self._started, self._printed = done, time.monotonic(), time.monotonic()
         self._console = Console(stderr=True)
@@ -22,6 +36,7 @@ class Bar:
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn(unit),
+            _Rate(),
             TextColumn("{task.fields[note]}", style="cyan"),
             TimeElapsedColumn(),
             TextColumn("ETA"),
@@ -29,6 +44,8 @@ class Bar:
             console=self._console,
             disable=not self._console.is_terminal,
             transient=True,
+            # Rich would send what is printed meanwhile to stderr: right on one terminal, wrong into a file or pipe.
+            redirect_stdout=sys.stdout.isatty(),
         )
         self._task = self._progress.add_task(what, total=total, completed=done, note="")
 
@@ -46,9 +63,23 @@ class Bar:
         now = time.monotonic()
         if not self._console.is_terminal and now - self._printed > LINE_EVERY_S:
             self._printed = now
-            left = (now - self._started) / max(done - self._first, 1) * (self.total - done)
-            self.say(f"{self.what}: {done}/{self.total} {self.unit}  {note}  ETA {left:.0f} s")
+            rate = max(done - self._first, 1) / (now - self._started)
+            of, eta = "", ""
+            if self.total is not None:
+                of, eta = f"/{self.total}", f"  ETA {(self.total - done) / rate:.0f} s"
+            self.say(f"{self.what}: {done}{of} {self.unit}  {_per_second(rate)}  {note}{eta}")
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
         self._console.print(line, highlight=False, soft_wrap=True)
+
+
+class _Rate(ProgressColumn):
+    """How fast it went of late."""
+
+    def render(self, task: Task) -> Text:
+        return Text(_per_second(task.speed) if task.speed else "", style="progress.data.speed")
+
+
+def _per_second(rate: float) -> str:
+    return f"{rate:.1f}/s" if rate >= 1 else f"{rate:.3f}/s"
