@@ -8,6 +8,11 @@ import numpy as np
 
 FLOAT, INT64 = 1, 7
 
+NAMES = ("cube", "ball")
+SIZE = 64
+"""Side of the image that `output` is for."""
+STRIDES = (8, 16, 32)
+
 
 def varint(n: int) -> bytes:
     out = bytearray()
@@ -65,3 +70,29 @@ def constant(
     entries = b"".join(field(14, field(1, k) + field(2, v)) for k, v in (metadata or {}).items())
     path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13)) + entries)
     return path
+
+
+def cells(anchors: int) -> np.ndarray:
+    """Column, row and stride of every row of the output."""
+    rows = []
+    for stride in STRIDES:
+        x, y = np.meshgrid(np.arange(SIZE // stride), np.arange(SIZE // stride))
+        rows += [np.stack([x.ravel(), y.ravel(), np.full(x.size, stride)], axis=1)] * anchors
+    return np.concatenate(rows).astype(float)
+
+
+def output(kind: str, classes: int = 2) -> np.ndarray:
+    """One box, centre (20, 28), 16 x 24 pixels, class "ball", in each network's own terms."""
+    column, row, stride = cells(3 if kind == "yolov5" else 1).T
+    centre = np.stack([(column + 0.5) * stride, (row + 0.5) * stride], axis=1)
+    size = np.full_like(centre, 5)
+    i = int(np.flatnonzero((column == 2) & (row == 3) & (stride == 8))[0])
+    centre[i], size[i] = (20, 28), (16, 24)
+    scores, objectness = np.zeros((len(centre), classes)), np.zeros((len(centre), 1))
+    scores[i, 1], objectness[i] = 0.9, 0.8
+    if kind == "yolov8":
+        return np.concatenate([centre, size, scores], axis=1).T[None]
+    if kind == "yolox":
+        centre = centre / stride[:, None] - np.stack([column, row], axis=1)
+        size = np.log(size / stride[:, None])
+    return np.concatenate([centre, size, objectness, scores], axis=1)[None]

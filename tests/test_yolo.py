@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from onnx_bytes import constant
+from onnx_bytes import NAMES, SIZE, STRIDES, constant, output
 from pickles import Shell, save
 from yolov5_bytes import ANCHORS, Architecture
 
@@ -13,10 +13,7 @@ from arm5dof.vision.onnx import OnnxYOLO
 from arm5dof.vision.yolov5 import YOLOv5
 from arm5dof.vision.yolov5_layers import Conv
 
-SIZE = 64
-STRIDES = (8, 16, 32)
 GREY = np.full((48, 64, 3), 100, np.uint8)
-NAMES = ("cube", "ball")
 
 
 # The published network
@@ -144,32 +141,7 @@ def test_files_of_other_networks_are_refused(tmp_path):
         YOLOv5(tmp_path / "f.pt", confidence=2)
 
 
-# ONNX: one box, centre (20, 28), 16 x 24 pixels, class "ball", in each network's own terms
-
-
-def cells(anchors):
-    """Column, row and stride of every row of the output."""
-    rows = []
-    for stride in STRIDES:
-        x, y = np.meshgrid(np.arange(SIZE // stride), np.arange(SIZE // stride))
-        rows += [np.stack([x.ravel(), y.ravel(), np.full(x.size, stride)], axis=1)] * anchors
-    return np.concatenate(rows).astype(float)
-
-
-def output(kind, classes=2):
-    column, row, stride = cells(3 if kind == "yolov5" else 1).T
-    centre = np.stack([(column + 0.5) * stride, (row + 0.5) * stride], axis=1)
-    size = np.full_like(centre, 5)
-    i = int(np.flatnonzero((column == 2) & (row == 3) & (stride == 8))[0])
-    centre[i], size[i] = (20, 28), (16, 24)
-    scores, objectness = np.zeros((len(centre), classes)), np.zeros((len(centre), 1))
-    scores[i, 1], objectness[i] = 0.9, 0.8
-    if kind == "yolov8":
-        return np.concatenate([centre, size, scores], axis=1).T[None]
-    if kind == "yolox":
-        centre = centre / stride[:, None] - np.stack([column, row], axis=1)
-        size = np.log(size / stride[:, None])
-    return np.concatenate([centre, size, objectness, scores], axis=1)[None]
+# ONNX
 
 
 @pytest.mark.parametrize("shape", [(1, 3, "h", "w"), (1, 3, SIZE, SIZE), ("batch", 3, SIZE, SIZE)])

@@ -15,13 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from arm5dof import files
 from arm5dof.errors import UserError
+from arm5dof.vision import detect_command
 
 if TYPE_CHECKING:
     from arm5dof.vision.boards import Board
     from arm5dof.vision.calibrate import Calibration, Views
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-"""What counts as a photograph in a folder; a file that is named may be called anything."""
 
 BAR_AFTER_S = 2.0
 
@@ -71,6 +69,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=calibrate)
 
+    detect_command.declare(commands)
+
 
 def calibrate(known: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision calibrate`."""
@@ -79,10 +79,11 @@ def calibrate(known: argparse.Namespace, rest: list[str]) -> None:
     _writable(known.out, (".yml", ".yaml"))
     if known.preview is not None:
         _writable(known.preview, (".png", ".jpg"))
-    paths = image_files(known.images)
 
     from arm5dof.vision import calibrate as calibration
+    from arm5dof.vision.sources import image_files
 
+    paths = image_files(known.images)
     board = _board(known)
     views = _watched(paths, board)
     result = calibration.calibrate(views, known.distortion)
@@ -101,22 +102,6 @@ def calibrate(known: argparse.Namespace, rest: list[str]) -> None:
             stack.enter_context(files.replacing(known.preview)).write_bytes(encoded)
         result.camera.save(known.out, notes)
     print(json.dumps(as_json(views, result)) if known.json else table(views, result) + f"\ncamera: {known.out}")
-
-
-def image_files(given: list[Path]) -> list[Path]:
-    """The photographs named, and those in the folders named, each once, in order."""
-    found: dict[Path, None] = {}
-    for path in given:
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
-            if not inside:
-                raise UserError(f"folder {path} holds no images ({', '.join(IMAGE_SUFFIXES)})")
-            found.update(dict.fromkeys(inside))
-        elif path.is_file():
-            found[path] = None
-        else:
-            raise UserError(f"no image and no folder {str(path)!r}")
-    return list(found)
 
 
 def table(views: Views, result: Calibration) -> str:

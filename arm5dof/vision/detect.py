@@ -1,0 +1,88 @@
+"""Detectors by the name of their file, and what they find in frames:
+
+    for frame, found in detect(open_source(["clip.mp4"]).frames, load("yolov5n.pt"), ["person"]):
+        print(frame.time, found.xyxy)
+
+with `open_source` of `arm5dof.vision.sources`.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from arm5dof.errors import UserError
+from arm5dof.vision.detections import Detections, Detector, check_known
+from arm5dof.vision.sources import Frame
+
+
+def load(
+    path: str | Path,
+    class_names: Sequence[str] | None = None,
+    confidence: float = 0.25,
+    iou: float = 0.45,
+    size: int | None = None,
+) -> Detector:
+    """The detector in a file: YOLOv5's own weights (`.pt`), or a network of the YOLO family as ONNX (`.onnx`). A file
+    called otherwise is told by its content.
+
+    class_names: names of the network's classes; without them, those in the file
+    confidence:  detections below are dropped
+    iou:         of boxes of one class that overlap more, the best stays
+    size:        side of the network's input in pixels; without it the file's, or 640 where that leaves it open
+
+    Raises `UserError` if the file is neither, is damaged, or tells apart another number of classes than are named.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"no detector {str(path)!r}: give a .pt or .onnx file")
+    # Each takes its second to import, and only one is needed.
+    match _kind(path):
+        case ".pt":
+            from arm5dof.vision.yolov5 import YOLOv5
+
+            return YOLOv5(path, class_names, confidence, iou, 640 if size is None else size)
+        case ".onnx":
+            from arm5dof.vision.onnx import OnnxYOLO
+
+            return OnnxYOLO(path, class_names, confidence, iou, size)
+        case _:
+            raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt) or a network as ONNX (.onnx)")
+
+
+def read_names(path: Path) -> list[str]:
+    """Names of classes from a text file with one in a line. Raises `UserError` if there are none, or it is no text."""
+    try:
+        names = path.read_text(encoding="utf-8-sig").strip().splitlines()
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}: give a text file with the name of a class in each line") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text: give one with the name of a class in each line") from None
+    if not names or not all(name.strip() for name in names):
+        raise UserError(f"{path} is empty or has an empty line: give the name of a class in each line, in their order")
+    return [name.strip() for name in names]
+
+
+def detect(
+    frames: Iterable[Frame], detector: Detector, classes: Sequence[str] | None = None
+) -> Iterator[tuple[Frame, Detections]]:
+    """Each frame with what the detector finds in it, of all classes or those named.
+
+    Raises `UserError` at once if the detector does not know such a class, and later whatever the frames raise.
+    """
+    if classes is None:
+        return ((frame, detector(frame.image)) for frame in frames)
+    check_known(classes, detector.class_names)
+    return ((frame, detector(frame.image).named(*classes)) for frame in frames)
+
+
+def _kind(path: Path) -> str | None:
+    """The suffix that a file has or, if it has another, should have."""
+    suffix = path.suffix.lower()
+    if suffix in (".pt", ".onnx"):
+        return suffix
+    if zipfile.is_zipfile(path):
+        return ".pt"
+    with open(path, "rb") as file:
+        return ".onnx" if file.read(1) == b"\x08" else None  # Its first field is the version of its format.
