@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -52,8 +53,8 @@ class Settings(Protocol):
 class Trainer:
     """A compiled training program for one environment and configuration.
 
-    `state` is the whole run, made by `start` or restored from a checkpoint; `advance` takes it one epoch further.
-    Raises `UserError` if the budget does not divide.
+    `state` is the whole run, made or gone on with by `start`; `advance` takes it one epoch further. Raises `UserError`
+    if the budget does not divide.
     """
 
     state: Training
@@ -73,7 +74,6 @@ class Trainer:
         self.total_steps = budget.episodes // budget.num_envs * length
         self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
         self._init = jax.jit(self.agent.init, compiler_options=xla.effort(0))
-        self._epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1, compiler_options=xla.effort(2))
 
     @property
     def replay_bytes(self) -> int:
@@ -94,24 +94,42 @@ class Trainer:
                 f"{free / 1e9:.1f} GB are free: choose a smaller one"
             )
 
-    def start(self) -> None:
-        """Begin a new run."""
+    def start(self, state: Training | None = None) -> None:
+        """Begin a new run, or go on with a restored one."""
         self.check_memory()
-        self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+        epoch = self._epoch  # Everything else is compiled while this is.
+        if state is None:
+            state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+        self.state = state
+        self._policy_distance()
+        epoch.result()
 
     def advance(self) -> dict[str, float]:
         """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and the
         mean distance in metres by which one answer of the policy, without noise, misses a few hundred targets."""
-        self.state, metrics = self._epoch(self.config.ddpg, self.state, self.config.train.epoch_steps)
-        policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)
-        metrics["policy_distance"] = policy(self._probes).error.mean()
+        self.state, metrics = self._epoch.result()(self.config.ddpg, self.state)
+        metrics["policy_distance"] = self._policy_distance()
         return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+    @cached_property
+    def _epoch(self) -> Future[jax.stages.Compiled]:
+        """The program of an epoch, compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
+        epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1, compiler_options=xla.effort(2))
+        lower, arguments = epoch.lower, (self.config.ddpg, self.like, self.config.train.epoch_steps)
+        return ThreadPoolExecutor(1).submit(lambda: lower(*arguments).compile())
+
+    def _policy_distance(self) -> jax.Array:
+        policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)
+        return policy(self._probes).error.mean()
 
     @cached_property
     def _probes(self) -> jax.Array:
         """Targets for watching the policy, from random numbers that neither training nor evaluation uses."""
-        key = jax.random.fold_in(jax.random.key(self.config.train.seed), 0x9B0E)
-        return jax.jit(jax.vmap(self.env.sample_goal))(jax.random.split(key, PROBES))
+
+        def sample(key: jax.Array) -> jax.Array:
+            return jax.vmap(self.env.sample_goal)(jax.random.split(jax.random.fold_in(key, 0x9B0E), PROBES))
+
+        return jax.jit(sample, compiler_options=xla.effort(0))(jax.random.key(self.config.train.seed))
 
     @property
     def counters(self) -> Counters:
