@@ -1,0 +1,113 @@
+"""Random pictures for tables, floors and things: two families that have no pattern in common.
+
+Each takes a generator and a size and gives a picture, RGB uint8 (size, size, 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+Pattern = Callable[[np.random.Generator, int], np.ndarray]
+
+
+def colour(rng: np.random.Generator, hue: float | None = None, vivid: float = 0.0) -> np.ndarray:
+    """A colour, RGB (3,) in [0, 1]: any, or of a `hue` in degrees, and no duller than `vivid` in [0, 1]."""
+    if hue is None:
+        hue, grey = rng.uniform(0, 360), rng.random() < 0.2 and not vivid
+    else:
+        hue, grey = (hue + rng.uniform(-10, 10)) % 360, False
+    saturation = 0.05 if grey else rng.uniform(max(vivid, 0.1), 1)
+    hsv = np.array([[[hue, saturation, rng.uniform(max(0.15, 0.8 * vivid), 1)]]], np.float32)
+    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB), float)[0, 0]
+
+
+def checker(rng: np.random.Generator, size: int) -> np.ndarray:
+    i, j = np.mgrid[:size, :size] * int(rng.choice([2, 4, 8, 16])) // size
+    return _between(rng, (i + j) % 2, contrast=rng.uniform(0.05, 1))
+
+
+def clouds(rng: np.random.Generator, size: int) -> np.ndarray:
+    return _between(rng, _noise(rng, size), contrast=rng.uniform(0.1, 1))
+
+
+def planks(rng: np.random.Generator, size: int) -> np.ndarray:
+    boards = int(rng.choice([2, 4, 8]))
+    tone = np.repeat(rng.random(boards), size // boards)[:, None]
+    grain = cv2.resize(rng.random((size // 2, 4)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+    seam = (np.arange(size) % (size // boards) > 0)[:, None]
+    return _between(rng, (0.6 * tone + 0.4 * grain) * seam, contrast=rng.uniform(0.1, 0.7))
+
+
+def plain(rng: np.random.Generator, size: int) -> np.ndarray:
+    return _between(rng, np.zeros((size, size)), contrast=0.0)
+
+
+def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
+    n, joint = int(rng.choice([2, 3, 5, 8])), int(rng.integers(1, 5))
+    i, j = np.mgrid[:size, :size]
+    grout = (i * n % size < joint * n) | (j * n % size < joint * n)
+    tone = rng.random((n, n))[i * n // size, j * n // size]
+    return _between(rng, np.where(grout, 1, 0.4 * tone), contrast=rng.uniform(0.1, 0.8))
+
+
+def marble(rng: np.random.Generator, size: int) -> np.ndarray:
+    i, j = np.mgrid[:size, :size] / size
+    waves = rng.integers(1, 5, 2)
+    veins = np.abs(np.sin(np.pi * (waves[0] * i + waves[1] * j + rng.uniform(0.5, 2) * _noise(rng, size))))
+    return _between(rng, veins ** rng.uniform(0.3, 3), contrast=rng.uniform(0.1, 0.9))
+
+
+def granite(rng: np.random.Generator, size: int) -> np.ndarray:
+    grains = cv2.resize(rng.random((size // 2, size // 2)).astype(np.float32), (size, size))
+    return _between(rng, grains > rng.uniform(0.5, 0.9), contrast=rng.uniform(0.1, 0.6))
+
+
+def weave(rng: np.random.Generator, size: int) -> np.ndarray:
+    i, j = np.mgrid[:size, :size] * 2 * np.pi * int(rng.choice([4, 8, 16, 32])) / size
+    return _between(rng, 0.5 + 0.25 * (np.sin(i) + np.sin(j)) * np.sign(np.sin(i / 2) * np.sin(j / 2) + 1e-9))
+
+
+def print_(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Printed paper: lines of dark words on white, and sometimes a figure."""
+    page = np.full((size, size), 1.0)
+    line = int(rng.integers(size // 32, size // 10))
+    for top in range(line, size - line, 2 * line):
+        left = line
+        while left < size - 2 * line:
+            right = left + int(rng.integers(line, 6 * line))
+            page[top : top + line, left : min(right, size - line)] = rng.uniform(0, 0.5)
+            left = right + line
+    if rng.random() < 0.4:
+        centre = tuple(int(v) for v in rng.integers(size // 4, 3 * size // 4, 2))
+        cv2.circle(page, centre, int(rng.integers(size // 10, size // 4)), rng.uniform(0, 0.6), -1)
+    ink, paper = colour(rng) * 0.4, np.full(3, rng.uniform(0.8, 1))
+    return _mix(page, ink, paper)
+
+
+TRAINING: tuple[Pattern, ...] = (checker, clouds, planks, plain)
+EVALUATION: tuple[Pattern, ...] = (tiles, marble, granite, weave)
+
+
+def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Smooth noise of five octaves, (size, size) in [0, 1]."""
+    total = np.zeros((size, size), np.float32)
+    roughness = rng.uniform(0.4, 0.8)
+    for octave in range(1, 6):
+        cells = rng.random((2**octave + 1, 2**octave + 1)).astype(np.float32)
+        total += roughness**octave * cv2.resize(cells, (size, size), interpolation=cv2.INTER_CUBIC)
+    total -= total.min()
+    return total / total.max()
+
+
+def _between(rng: np.random.Generator, share: np.ndarray, contrast: float = 1.0) -> np.ndarray:
+    """A random colour where `share` (size, size) is 0, and where it is 1 one that differs by `contrast`."""
+    first, second = colour(rng), colour(rng)
+    return _mix(share, first, first + contrast * (second - first))
+
+
+def _mix(share: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    picture = first + np.asarray(share, float)[..., None] * (second - first)
+    return np.clip(np.round(picture * 255), 0, 255).astype(np.uint8)

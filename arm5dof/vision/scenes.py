@@ -1,0 +1,195 @@
+"""Random tabletop scenes: the arm in some pose, things of the catalogue, and much else, under random light.
+
+A scene is a model of its own, compiled in milliseconds, so nothing of one can linger in the next, and everything in it
+follows from its seed. The world frame is the arm's base, z up; the table's top is z = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, get_args
+
+import mujoco
+import numpy as np
+
+from arm5dof import files
+from arm5dof.errors import UserError
+from arm5dof.vision import patterns
+from arm5dof.vision.catalogue import BOX, CATALOGUE, CYLINDER, Part, Thing
+from arm5dof.vision.scenery import Builder, camera, lamps, other_shape
+
+Style = Literal["training", "evaluation"]
+"""Which textures and lights: the two have no pattern and no kind of lamp in common."""
+
+NEAREST, FARTHEST = 0.10, 0.25
+"""Where things lie: metres from the arm's axis."""
+AROUND = np.deg2rad(100)
+"""And how far round it to either side of the x axis."""
+GAP = 0.006
+"""Between one thing and the next, metres."""
+MOST_THINGS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A thing in a scene."""
+
+    class_id: int
+    position: np.ndarray
+    """Of its middle in the base frame, (3,), metres."""
+    yaw: float
+    geoms: np.ndarray
+    """Ids of its geoms, (n,)."""
+
+    @property
+    def thing(self) -> Thing:
+        return CATALOGUE[self.class_id]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A model with a camera called `camera`, its data after `mj_forward`, and the things in it."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    things: tuple[Placed, ...]
+
+
+def random_scene(seed: int | tuple[int, ...], style: Style = "training") -> Scene:
+    """The scene of a seed; a tuple, such as (run, number), is a seed too. The same seed gives the same bits."""
+    if style not in get_args(Style):
+        raise UserError(f"no style {style!r}: there are {' and '.join(get_args(Style))}")
+    rng = np.random.default_rng([get_args(Style).index(style), *np.atleast_1d(seed)])
+    spec = _arm_spec().copy()
+    builder = Builder(spec, rng, patterns.TRAINING if style == "training" else patterns.EVALUATION)
+
+    pose, obstacles = _arm_pose(rng)
+    builder.paint_arm()
+    builder.room()
+    things = _place_things(builder, obstacles)
+    _place_others(builder, obstacles, [(p.position, p.thing.radius) for p in things])
+    lamps(spec, rng, style == "training")
+    camera(spec, rng)
+
+    model = spec.compile()
+    for name, picture in builder.pictures.items():
+        first = model.tex_adr[model.texture(name).id]
+        model.tex_data[first : first + picture.size] = picture.ravel()
+    data = mujoco.MjData(model)
+    data.qpos[:] = pose
+    mujoco.mj_forward(model, data)
+    placed = tuple(
+        Placed(p.class_id, p.position, p.yaw, np.array([model.geom(name).id for name in p.names])) for p in things
+    )
+    return Scene(model, data, placed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lying:
+    class_id: int
+    position: np.ndarray
+    yaw: float
+    names: tuple[str, ...]
+
+    @property
+    def thing(self) -> Thing:
+        return CATALOGUE[self.class_id]
+
+
+@dataclass(frozen=True, eq=False)
+class _Obstacles:
+    """Oriented boxes round the arm's geoms: centres (n, 3), axes (n, 3, 3), half sizes (n, 3)."""
+
+    centres: np.ndarray
+    axes: np.ndarray
+    halves: np.ndarray
+
+    def distance(self, point: np.ndarray) -> float:
+        """From a point (3,) to the nearest of them."""
+        local = np.einsum("ni,nij->nj", point - self.centres, self.axes)
+        return float(np.linalg.norm(np.maximum(np.abs(local) - self.halves, 0), axis=-1).min())
+
+    def lowest(self) -> np.ndarray:
+        """How low each reaches, (n,)."""
+        return self.centres[:, 2] - (np.abs(self.axes[:, 2]) * self.halves).sum(-1)
+
+
+def _place_things(builder: Builder, obstacles: _Obstacles) -> list[_Lying]:
+    """Up to six things, apart from each other and from the arm."""
+    rng = builder.rng
+    lying: list[_Lying] = []
+    for _ in range(rng.integers(0, MOST_THINGS + 1)):
+        class_id = int(rng.integers(len(CATALOGUE)))
+        thing = CATALOGUE[class_id]
+        for _ in range(30):
+            radius, angle = np.sqrt(rng.uniform(NEAREST**2, FARTHEST**2)), rng.uniform(-AROUND, AROUND)
+            position = np.array([radius * np.cos(angle), radius * np.sin(angle), thing.half_height])
+            room = max(thing.radius, thing.half_height) + GAP
+            others = [np.linalg.norm(p.position[:2] - position[:2]) - p.thing.radius for p in lying]
+            if obstacles.distance(position) > room and min(others, default=1.0) > thing.radius + GAP:
+                yaw = float(rng.uniform(-np.pi, np.pi))
+                body, material = builder.body(position, yaw), builder.thing_material(thing.hue)
+                names = tuple(builder.add(body, part, material) for part in thing.parts)
+                lying.append(_Lying(class_id, position, yaw, names))
+                break
+    return lying
+
+
+def _place_others(builder: Builder, obstacles: _Obstacles, taken: list[tuple[np.ndarray, float]]) -> None:
+    """What the detector must not mistake for a thing: solid shapes, and paper lying flat."""
+    rng = builder.rng
+    for _ in range(rng.integers(0, 6)):
+        parts, height, reach = other_shape(rng)
+        position = np.array([*rng.uniform([-0.25, -0.4], [0.4, 0.4]), height])
+        clear = min((np.linalg.norm(p[:2] - position[:2]) - r for p, r in taken), default=1.0) > reach + GAP
+        if clear and obstacles.distance(position) > max(reach, height) + GAP:
+            hue = float(rng.uniform(60, 150)) if reach < 0.018 else None
+            body, material = builder.body(position, rng.uniform(-np.pi, np.pi)), builder.thing_material(hue)
+            for part in parts:
+                builder.add(body, part, material)
+            taken.append((position, reach))
+    for layer in range(rng.integers(0, 5)):
+        thin = 0.0002 * (layer + 1)
+        size = rng.uniform(0.008, 0.08, 2) if rng.random() < 0.7 else np.repeat(rng.uniform(0.01, 0.03), 2)
+        kind = rng.random()
+        if kind < 0.4:
+            material = builder.material(patterns.print_)
+        elif kind < 0.6:
+            material = builder.material(patterns.checker)
+        else:
+            material = builder.material(None, patterns.colour(rng))
+        body = builder.body(np.array([*rng.uniform([-0.2, -0.35], [0.35, 0.35]), 0.0]), rng.uniform(-np.pi, np.pi))
+        disc = kind >= 0.6 and rng.random() < 0.4
+        builder.add(body, Part(CYLINDER, (size[0], thin)) if disc else Part(BOX, (*size, thin)), material)
+
+
+@cache
+def _arm_spec() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_file(str(files.find("mjcf", "arm5.xml")))
+    spec.visual.quality.shadowsize = 2048
+    spec.visual.quality.numquads = 8
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 20
+    spec.stat.extent, spec.stat.center = 1.0, [0.1, 0, 0.1]
+    return spec
+
+
+@cache
+def _arm_model() -> mujoco.MjModel:
+    return _arm_spec().copy().compile()
+
+
+def _arm_pose(rng: np.random.Generator) -> tuple[np.ndarray, _Obstacles]:
+    """Joint positions (nq,) that keep the arm off the table, and the space that it then takes."""
+    model = _arm_model()
+    data = mujoco.MjData(model)
+    moving = model.body_weldid[model.geom_bodyid] > 0
+    while True:
+        data.qpos[:] = rng.uniform(*model.jnt_range.T)
+        mujoco.mj_kinematics(model, data)
+        axes = data.geom_xmat.reshape(-1, 3, 3)
+        centres = data.geom_xpos + np.einsum("nij,nj->ni", axes, model.geom_aabb[:, :3])
+        obstacles = _Obstacles(centres, axes.copy(), model.geom_aabb[:, 3:])
+        if obstacles.lowest()[moving].min() > 0.003:
+            return data.qpos.copy(), obstacles

@@ -1,0 +1,198 @@
+"""`SoftwareRenderer`: pictures of a MuJoCo scene with nothing but NumPy and OpenCV's triangle rasteriser.
+
+It draws MuJoCo's own abstract scene (`mjvScene`) as MuJoCo's OpenGL renderer does: lit at the vertices, interpolated
+between them, multiplied by the texture, shadow by shadow. What it leaves out: smoothed edges (draw more pixels and
+shrink the picture), reflections, haze, planes seen from behind, and a mesh's own texture coordinates; what is half
+transparent it draws as if it were not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import mujoco
+import numpy as np
+
+from arm5dof.vision import shading
+from arm5dof.vision.camera import Camera
+from arm5dof.vision.meshes import BOX, PLANE, Assembler, Solid
+from arm5dof.vision.raster import Raster
+
+GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
+COLOUR_TEXTURE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+NO_LIGHT = 0.3
+"""The light that is everywhere in a scene without any."""
+FURNITURE = 0.3
+"""Half width, in metres, of boxes whose shadows fall on planes alone: tables. They would blur those of all else."""
+
+
+class _View(NamedTuple):
+    """What the camera sees where."""
+
+    geoms: list[mujoco.MjvGeom]
+    solid: Solid
+    raster: Raster
+    planes: np.ndarray
+    """A depth buffer with the planes alone, (h, w)."""
+    owner: np.ndarray
+    """Which of the geoms is seen in a pixel, (h, w) int32; -1 for none."""
+    buffer: np.ndarray
+    """The depth buffer, (h, w)."""
+
+
+class SoftwareRenderer:
+    """A camera of a MuJoCo model, drawn by the CPU. `data` must have been through `mj_forward`."""
+
+    def __init__(self, model: mujoco.MjModel, camera: str, width: int, height: int) -> None:
+        self.model, self.camera, self.width, self.height = model, camera, width, height
+        self._scene = mujoco.MjvScene(model, maxgeom=10_000)
+        self._option, self._viewer = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._viewer.type, self._viewer.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
+        self._assembler = Assembler(model)
+        self._textures: dict[int, shading.Texture] = {}
+
+    def depth(self, data: mujoco.MjData) -> np.ndarray:
+        """Metres along the optical axis, (h, w) float32; infinite where there is nothing."""
+        view = self._see(data)
+        return np.where(view.owner >= 0, view.raster.depth(view.buffer), np.float32(np.inf))
+
+    def segmentation(self, data: mujoco.MjData) -> np.ndarray:
+        """The id of the geom that is seen, (h, w) int32; -1 where there is none."""
+        view = self._see(data)
+        return np.array([*_ids(view.geoms), -1], np.int32)[view.owner]
+
+    def outlines(self, data: mujoco.MjData, groups: Sequence[np.ndarray]) -> list[int]:
+        """How many pixels each group of geoms, given by their ids, would cover if nothing hid them and the picture
+        had no edges. They must be in front of the camera and no planes."""
+        view = self._see(data)
+        ids = np.array(_ids(view.geoms))[view.solid.owner[view.solid.triangles[:, 0]]]
+        return [view.raster.outline(view.solid.triangles[np.isin(ids, group)]) for group in groups]
+
+    def rgb(self, data: mujoco.MjData) -> np.ndarray:
+        """The picture, (h, w, 3) uint8."""
+        view = self._see(data)
+        raster, solid, eye = view.raster, view.solid, view.raster.eye
+        points = eye + raster.rays * raster.depth(view.buffer)[..., None]
+        lights = shading.lights(self._scene)
+        everywhere = NO_LIGHT * (not lights)
+        body = _surface(view.geoms, solid.owner, solid.vertices, solid.normals)
+        emission = np.array([geom.emission for geom in view.geoms], np.float32)
+        planes = []
+        for g, geom in enumerate(view.geoms):
+            if geom.type == PLANE and (mask := view.owner == g).any():
+                normals = np.broadcast_to(geom.mat[:, 2], (int(mask.sum()), 3))
+                planes.append(
+                    (mask, _surface(view.geoms, np.full(len(normals), g), points[mask], normals), emission[g])
+                )
+
+        def draw(some: list[shading.Light], base: float, glow: float) -> np.ndarray:
+            """The picture in some of the lights, and what there is without: `base` everywhere, `glow` of what glows."""
+
+            def colours(surface: shading.Surface, own: np.ndarray) -> np.ndarray:
+                total = (base + glow * own) * surface.rgb
+                for light in some:
+                    total = total + shading.lit(surface, light, eye)
+                return np.minimum(total, 1)
+
+            picture = np.zeros((*raster.shape, 3), np.float32)
+            raster.draw(colours(body, emission[solid.owner, None]), picture, view.planes.copy())
+            for mask, surface, own in planes:
+                picture[mask] = colours(surface, own)
+            return picture
+
+        picture = draw([light for light in lights if not light.shadow], everywhere, 1)
+        large = np.array([geom.type == BOX and geom.size.max() > FURNITURE for geom in view.geoms], bool)
+        thrown_by_large = large[solid.owner[solid.triangles[:, 0]]]
+        on_plane = np.array([geom.type == PLANE for geom in view.geoms] + [False])[view.owner]
+        for light in (light for light in lights if light.shadow):
+            lit = draw([light], 0, 0)
+            for which, receiver in ((~thrown_by_large, view.owner >= 0), (thrown_by_large, on_plane)):
+                if which.any() and receiver.any():
+                    crop, _ = _crop(receiver)
+                    shadow = shading.ShadowMap(light, solid.vertices, solid.triangles[which])
+                    lit[crop] *= shadow.light(points[crop])[..., None]
+            picture += lit
+        self._texture(view, points, picture)
+        return (np.minimum(picture, 1) * 255 + 0.5).astype(np.uint8)
+
+    def _see(self, data: mujoco.MjData) -> _View:
+        """Everything about the picture but its colours."""
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, data, self._option, None, self._viewer, every, self._scene)
+        geoms = list(self._scene.geoms[: self._scene.ngeom])
+        near, far = (z * self.model.stat.extent for z in (self.model.vis.map.znear, self.model.vis.map.zfar))
+        raster = Raster(Camera.from_mujoco(self.model, self.camera, self.width, self.height, data), near, far)
+
+        planes = np.ones(raster.shape, np.float32)
+        owner = np.full((*raster.shape, 3), -1, np.float32)
+        for g, geom in enumerate(geoms):
+            if geom.type == PLANE:
+                buffer = raster.meet(geom)
+                owner[buffer < planes] = g
+                planes = np.minimum(planes, buffer)
+        solid = self._assembler.solid(geoms)
+        raster.load(solid.vertices, solid.triangles)
+        buffer = planes.copy()
+        raster.draw(np.repeat(solid.owner[:, None], 3, 1), owner, buffer, flat=True)
+        return _View(geoms, solid, raster, planes, owner[..., 0].astype(np.int32), buffer)
+
+    def _texture(self, view: _View, points: np.ndarray, picture: np.ndarray) -> None:
+        """Multiply a picture by the textures of what is seen, and put the sky behind it."""
+        counts = np.bincount(view.owner.ravel() + 1, minlength=len(view.geoms) + 1)
+        skies = np.flatnonzero(self.model.tex_type == SKY)
+        if counts[0] and len(skies):
+            crop, sky = _crop(view.owner == -1)
+            colours = self._load(skies[0]).around(
+                view.raster.rays[crop][..., [0, 2, 1]] * np.array([1, 1, -1], np.float32)
+            )
+            np.copyto(picture[crop], colours, where=sky)
+        for g in np.flatnonzero(counts[1:]):
+            geom = view.geoms[g]
+            texture, repeat, uniform = geom.texid, geom.texrepeat, geom.texuniform
+            if texture < 0 and geom.matid >= 0:
+                texture = self.model.mat_texid[geom.matid, COLOUR_TEXTURE]
+                repeat, uniform = self.model.mat_texrepeat[geom.matid], self.model.mat_texuniform[geom.matid]
+            if texture < 0 or geom.texcoord:
+                continue
+            crop, mask = _crop(view.owner == g)
+            image = self._load(texture)
+            size = np.where(geom.size > 0, geom.size, 1)
+            scale = geom.mat.T if image.cube and uniform else geom.mat.T / size[:, None]
+            local = cv2.transform(points[crop], np.c_[scale, -scale @ geom.pos])
+            if image.cube:
+                colours = image.around(local)
+            else:
+                u, v = local[..., 0], local[..., 1]
+                if geom.type == BOX:
+                    axis = np.abs(local).argmax(-1)
+                    u, v = np.where(axis == 0, v, u), np.where(axis == 2, v, local[..., 2])
+                times = (repeat * (size[:2] if uniform else 1)).astype(np.float32) / 2
+                colours = image.flat(times[0] * (1 + u), times[1] * (1 - v))
+            np.multiply(picture[crop], colours, out=picture[crop], where=mask)
+
+    def _load(self, texture: int) -> shading.Texture:
+        if texture not in self._textures:
+            self._textures[texture] = shading.Texture(self.model, texture)
+        return self._textures[texture]
+
+
+def _ids(geoms: list[mujoco.MjvGeom]) -> list[int]:
+    return [geom.objid if geom.objtype == GEOM else -1 for geom in geoms]
+
+
+def _crop(mask: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
+    """The rectangle that a mask (h, w) takes, and the mask in it, (h', w', 1)."""
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    crop = np.s_[top : top + height, left : left + width]
+    return crop, mask[crop][..., None]
+
+
+def _surface(
+    geoms: list[mujoco.MjvGeom], owner: np.ndarray, points: np.ndarray, normals: np.ndarray
+) -> shading.Surface:
+    rgb = np.array([geom.rgba[:3] for geom in geoms], np.float32).reshape(-1, 3)
+    gloss = np.array([(geom.specular, geom.shininess) for geom in geoms], np.float32).reshape(-1, 2)
+    return shading.Surface(points, normals, rgb[owner], gloss[owner])

@@ -1,0 +1,140 @@
+"""Random tabletop scenes: what lies in them, and what is said to be seen of it."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from arm5dof.errors import UserError
+from arm5dof.vision import patterns
+from arm5dof.vision.camera import Camera
+from arm5dof.vision.catalogue import CATALOGUE, CLASS_NAMES, HALF_HEIGHTS
+from arm5dof.vision.scenery import CAMERA
+from arm5dof.vision.scenes import FARTHEST, MOST_THINGS, NEAREST, random_scene
+from arm5dof.vision.simulated import simulated_camera
+from arm5dof.vision.truth import VISIBLE, truth
+
+SEEDS = st.integers(0, 2**32 - 1)
+STYLES = st.sampled_from(["training", "evaluation"])
+
+
+def rendered(scene, width=320, height=240):
+    return simulated_camera(scene.model, CAMERA, width, height, "software")
+
+
+def test_the_catalogue_is_what_compiles():
+    """Half heights, radii and symmetry against what a camera above and one beside the compiled parts see."""
+    assert len(CATALOGUE) >= 6 and len(set(CLASS_NAMES)) == len(CATALOGUE) and set(HALF_HEIGHTS) == set(CLASS_NAMES)
+    for thing in CATALOGUE:
+        spec = mujoco.MjSpec()
+        for part in thing.parts:
+            size = [*part.size, *[0] * (3 - len(part.size))]
+            spec.worldbody.add_geom(type=part.kind, size=size, pos=part.position, quat=part.quaternion)
+        spec.worldbody.add_camera(name="camera", pos=[0, 0, 1], fovy=8)
+        spec.worldbody.add_camera(name="side", pos=[0, -1, 0], xyaxes=[1, 0, 0, 0, 0, 1], fovy=8)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        above = rendered_by(model, data, "camera")
+        assert above[:, 2].max() == pytest.approx(thing.half_height, abs=2e-4)
+        assert np.hypot(above[:, 0], above[:, 1]).max() == pytest.approx(thing.radius, abs=6e-4)
+        assert np.abs(above.mean(0))[:2].max() < 2e-4
+        side = rendered_by(model, data, "side")
+        assert side[:, 2].min() == pytest.approx(-thing.half_height, abs=4e-4)
+        assert 0.0195 <= 2 * min(np.abs(above[:, 0]).max(), np.abs(above[:, 1]).max()) <= 0.0405
+
+
+def rendered_by(model, data, name):
+    """Points (n, 3) that a camera sees."""
+    simulated = simulated_camera(model, name, 400, 400, "software")
+    rows, columns = np.nonzero(simulated.segmentation(data) >= 0)
+    camera = Camera.from_mujoco(model, name, 400, 400, data)
+    return np.asarray(camera.back_project(np.c_[columns, rows], simulated.depth(data)[rows, columns]), float)
+
+
+@settings(max_examples=8)
+@given(SEEDS, STYLES)
+def test_the_same_seed_gives_the_same_bits(seed, style):
+    first, again = (random_scene(seed, style) for _ in range(2))
+    np.testing.assert_array_equal(rendered(first).rgb(first.data), rendered(again).rgb(again.data))
+    np.testing.assert_array_equal(first.data.qpos, again.data.qpos)
+    other = random_scene((seed, 1), style)
+    assert not np.array_equal(other.data.qpos, first.data.qpos)
+
+
+def test_styles_have_nothing_in_common():
+    assert not set(patterns.TRAINING) & set(patterns.EVALUATION)
+    for style, kind in (
+        ("training", mujoco.mjtLightType.mjLIGHT_SPOT),
+        ("evaluation", mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
+    ):
+        for seed in range(5):
+            assert (random_scene(seed, style).model.light_type == kind).all()
+    with pytest.raises(UserError, match="no style 'holiday': there are training and evaluation"):
+        random_scene(0, "holiday")
+
+
+@settings(max_examples=30)
+@given(SEEDS, STYLES)
+def test_things_lie_apart_on_the_table_within_reach(seed, style):
+    scene = random_scene(seed, style)
+    model, data = scene.model, scene.data
+    assert len(scene.things) <= MOST_THINGS
+    arm = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] > 0]
+    assert all(data.geom_xpos[g, 2] > 0 for g in arm)
+    points = np.zeros(6)
+    for i, placed in enumerate(scene.things):
+        assert placed.position[2] == placed.thing.half_height == HALF_HEIGHTS[placed.thing.name]
+        assert NEAREST <= np.hypot(*placed.position[:2]) <= FARTHEST
+        body = model.geom_bodyid[placed.geoms[0]]
+        np.testing.assert_allclose(data.xpos[body], placed.position)
+        others = [g for other in scene.things[:i] for g in other.geoms] + arm
+        for g in placed.geoms:
+            assert all(mujoco.mj_geomDistance(model, data, g, o, 0.001, points) >= 0.001 for o in others)
+
+
+@settings(max_examples=15)
+@given(SEEDS, STYLES)
+def test_truth_is_what_the_segmentation_shows(seed, style):
+    scene = random_scene(seed, style)
+    ids = rendered(scene).segmentation(scene.data)
+    found = truth(scene, ids)
+    camera = Camera.from_mujoco(scene.model, CAMERA, 320, 240, scene.data)
+    by_place = {tuple(placed.position): placed for placed in scene.things}
+    assert found.counts.dtype == bool and (found.counts == (found.visible >= VISIBLE)).all()
+    for i in range(len(found)):
+        placed = by_place[tuple(found.position[i])]
+        assert placed.class_id == found.class_id[i]
+        mask = np.isin(ids, placed.geoms)
+        left, top, right, bottom = found.xyxy[i].astype(int)
+        assert mask[top:bottom, left:right].sum() == mask.sum()
+        edges = mask[top], mask[bottom - 1], mask[:, left], mask[:, right - 1]
+        assert all(edge.any() for edge in edges)
+        # The middle of the box of a thing that nothing hides is where its middle is seen.
+        if found.visible[i] > 0.99:
+            centre = (found.xyxy[i, :2] + found.xyxy[i, 2:]) / 2 - 0.5
+            np.testing.assert_allclose(centre, camera.project(found.position[i]), atol=1.0)
+    seen = {tuple(p) for p in found.position}
+    for placed in scene.things:
+        assert np.isin(ids, placed.geoms).any() == (tuple(placed.position) in seen)
+
+
+def test_visibility_is_the_share_of_the_outline_that_is_seen():
+    """Against pictures with nothing but the thing itself, by a camera that sees further to all sides."""
+    for seed in range(6):
+        scene = random_scene(seed)
+        found = truth(scene, rendered(scene).segmentation(scene.data))
+        for i, position in enumerate(found.position):
+            placed = next(p for p in scene.things if (p.position == position).all())
+            ids = rendered(scene).segmentation(scene.data)
+            seen = np.isin(ids, placed.geoms).sum()
+            model = scene.model
+            field = np.tan(np.deg2rad(model.cam_fovy[0]) / 2)
+            group, fovy = model.geom_group.copy(), model.cam_fovy.copy()
+            model.geom_group[:] = 4
+            model.geom_group[placed.geoms] = 0
+            model.cam_fovy[0] = np.rad2deg(2 * np.arctan(3 * field))
+            alone = (rendered(scene, 960, 720).segmentation(scene.data) >= 0).sum()
+            model.geom_group[:], model.cam_fovy[:] = group, fovy
+            assert found.visible[i] == pytest.approx(min(seen / alone, 1), abs=0.02)
