@@ -36,7 +36,7 @@ class Builder:
         self.add(self.spec.worldbody, Part(BOX, half, shift), table)
         floor = self.material(self._pattern(), repeat=self.rng.uniform(0.5, 4))
         self.spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1], pos=[0, 0, -self.rng.uniform(0.4, 0.9)], material=floor
+            type=mujoco.mjtGeom.mjGEOM_PLANE, size=[6, 6, 0.1], pos=[0, 0, -self.rng.uniform(0.4, 0.9)], material=floor
         )
 
     def material(

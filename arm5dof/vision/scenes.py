@@ -168,7 +168,7 @@ def _place_others(builder: Builder, obstacles: _Obstacles, taken: list[tuple[np.
 def _arm_spec() -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(files.find("mjcf", "arm5.xml")))
     spec.visual.quality.shadowsize = 2048
-    spec.visual.quality.numquads = 8
+    spec.visual.quality.numslices, spec.visual.quality.numstacks, spec.visual.quality.numquads = 24, 12, 8
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
     spec.visual.map.znear, spec.visual.map.zfar = 0.02, 20
     spec.stat.extent, spec.stat.center = 1.0, [0.1, 0, 0.1]

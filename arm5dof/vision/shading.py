@@ -16,6 +16,10 @@ SPOT, DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_SPOT), int(mujoco.mjtLightTy
 
 SHININESS = 128.0
 """OpenGL's exponent of a material whose shininess is 1."""
+AHEAD = 0.0015
+"""A surface is in shadow where something is nearer to the light by more than so many metres."""
+CLOSE = 0.01
+"""Nothing nearer to a lamp, in metres, throws a shadow, nor anything behind it."""
 DISTANT = 30.0
 """Metres from which a directional light throws its shadows."""
 
@@ -105,16 +109,15 @@ class Texture:
         self.cube = model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D
         if self.cube and width == height:
             data = np.tile(data, (6, 1, 1))
-        self.levels = [np.ascontiguousarray(data)]
+        self.levels = [data.astype(np.float32) / 255]
 
     def flat(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Colours (h, w, 3) in [0, 1] of a two-dimensional texture, repeated for ever, at coordinates (h, w)."""
         height, width = self.levels[0].shape[:2]
-        texels = max(_spacing(u) * width, _spacing(v) * height)
-        image = self._level(texels)
+        image = self._level(_spacing(u * width, v * height))
         height, width = image.shape[:2]
         u, v = (u - np.floor(u.min())) * width - 0.5, (v - np.floor(v.min())) * height - 0.5
-        return cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(np.float32) / 255
+        return cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
     def around(self, direction: np.ndarray) -> np.ndarray:
         """Colours (h, w, 3) in [0, 1] of a cube texture in directions (h, w, 3), as OpenGL numbers the cube's sides."""
@@ -127,11 +130,11 @@ class Texture:
         t = np.choose(axis, [-y, np.where(back, -z, z), -y])
         major = np.maximum(np.abs(major), 1e-9)
         s, t = (s / major + 1) / 2, (t / major + 1) / 2
-        image = self._level(max(_spacing(s), _spacing(t)) * self.levels[0].shape[1])
+        image = self._level(_spacing(s, t) * self.levels[0].shape[1])
         width = image.shape[1]
         u, v = (np.clip(a * width - 0.5, 0, width - 1).astype(np.float32) for a in (s, t))
         v += (width * (2 * axis + back)).astype(np.float32)
-        return cv2.remap(image, u, v, cv2.INTER_LINEAR).astype(np.float32) / 255
+        return cv2.remap(image, u, v, cv2.INTER_LINEAR)
 
     def _level(self, texels: float) -> np.ndarray:
         """The level where neighbouring pixels lie nearest to one texel apart, if they do `texels` in the first."""
@@ -143,37 +146,39 @@ class Texture:
         return self.levels[min(level, len(self.levels) - 1)]
 
 
-def _spacing(coordinate: np.ndarray) -> float:
-    """How far a coordinate (h, w) goes from pixel to pixel: the median, so that its jumps do not count."""
-    steps = [np.abs(np.diff(coordinate, axis=axis)) for axis in (0, 1)]
-    return max((float(np.median(s[:: max(1, len(s) // 32)])) for s in steps if s.size), default=0.0)
+def _spacing(u: np.ndarray, v: np.ndarray) -> float:
+    """How far apart neighbouring pixels lie in coordinates (h, w): the median, so that jumps do not count."""
+    height, width = u.shape
+    some = np.s_[: height - 1 : max(1, height // 32), : width - 1 : max(1, width // 32)]
+    steps = [np.hypot(*(a[neighbour][some] - a[some] for a in (u, v))) for neighbour in (np.s_[1:], np.s_[:, 1:])]
+    return max((float(np.sort(s, axis=None)[s.size // 2]) for s in steps if s.size), default=0.0)
 
 
 class ShadowMap:
     """What a light sees of whatever throws shadows, from behind: the sides that it does not light."""
 
-    SIZE = 512
-    SOFT = 0.0015
-    """A surface is in shadow where something is nearer to the light by more than so many metres."""
-
-    def __init__(self, light: Light, vertices: np.ndarray, triangles: np.ndarray) -> None:
-        """`vertices` (n, 3) and `triangles` (m, 3), counter-clockwise, of all that throws shadows."""
+    def __init__(self, light: Light, vertices: np.ndarray, triangles: np.ndarray, size: int) -> None:
+        """`vertices` (n, 3) and `triangles` (m, 3), counter-clockwise, of all that throws shadows, and how many pixels
+        wide the map is to be."""
         z = light.direction.astype(float)
         x = np.cross(z, [0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0])
         x /= np.linalg.norm(x)
         self._axes = np.stack([x, np.cross(z, x), z])
-        used = vertices[np.unique(triangles)]
         # A directional light is a very distant one: the rasteriser knows perspective alone.
-        self._eye = used.mean(0) - DISTANT * z if light.directional else light.position.astype(float)
-        depth = np.maximum((used - self._eye) @ z, 1e-3)
-        plane = (used - self._eye) @ self._axes[:2].T / depth[:, None]
+        self._eye = vertices.mean(0) - DISTANT * z if light.directional else light.position.astype(float)
+        seen = (vertices - self._eye) @ self._axes.T
+        triangles = np.ascontiguousarray(triangles[(seen[:, 2] > CLOSE)[triangles].all(1)])
+        used = np.zeros(len(vertices), bool)
+        used[triangles] = True
+        corners = seen[used] if used.any() else np.array([[0.0, 0.0, 1.0]])
+        plane = corners[:, :2] / corners[:, 2:]
         self._centre = (plane.max(0) + plane.min(0)) / 2
         self._half = max(float(np.ptp(plane, axis=0).max()) / 2, 1e-6) * 1.02
-        near, far = float(depth.min()) * 0.99, float(depth.max()) * 1.01
+        near, far = float(corners[:, 2].min()) * 0.99, float(corners[:, 2].max()) * 1.01
         self._inverse = np.array([1 / near, 1 / near - 1 / far])
-        seen = (vertices - self._eye) @ self._axes.T
         seen[:, :2] -= self._centre * seen[:, 2:]
-        self._map = np.ones((self.SIZE, self.SIZE), np.float32)
+        self._size = size
+        self._map = np.ones((self._size, self._size), np.float32)
         settings = cv2.TriangleRasterizeSettings()
         settings.setCullingMode(cv2.RASTERIZE_CULLING_CCW)
         settings.setGlCompatibleMode(cv2.RASTERIZE_COMPAT_INVDEPTH)
@@ -181,24 +186,15 @@ class ShadowMap:
         field = 2 * np.arctan(self._half)
         cv2.triangleRasterizeDepth(seen, triangles, self._map, np.eye(4), field, near, far, settings)
 
-    def light(self, points: np.ndarray) -> np.ndarray:
-        """How much of the light reaches points (h, w, 3), (h, w) in [0, 1]."""
+    def reaches(self, points: np.ndarray) -> np.ndarray:
+        """Whether the light reaches points (h, w, 3): (h, w) bool."""
         transform = np.c_[self._axes, -self._axes @ self._eye]
         transform[:2] -= self._centre[:, None] * transform[2]
-        transform[:2] *= self.SIZE / 2 / self._half
+        transform[:2] *= self._size / 2 / self._half
         x, y, depth = cv2.split(cv2.transform(points, transform))
-        middle = (self.SIZE - 1) / 2
-        u, v = x / depth + middle, y / depth + middle
-        # What a depth buffer would hold for something nearer to the light by `SOFT`; 1 is what it holds for nothing.
-        threshold = np.minimum((self._inverse[0] - 1 / np.maximum(depth - self.SOFT, 1e-6)) / self._inverse[1], 1)
-        i, j = np.floor(u), np.floor(v)
-        # Percentage-closer filtering by hand: compare with the four texels around, then interpolate.
-        shade = np.zeros_like(depth)
-        for dx in (0, 1):
-            for dy in (0, 1):
-                stored = cv2.remap(
-                    self._map, i + dx, j + dy, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
-                )
-                weight = np.abs(1 - dx - (u - i)) * np.abs(1 - dy - (v - j))
-                shade += weight * (stored >= threshold)
-        return shade
+        middle = (self._size - 1) / 2
+        u, v = (np.asarray(a / depth + middle, np.float32) for a in (x, y))
+        # What a depth buffer would hold for something nearer to the light by `AHEAD`; 1 is what it holds for nothing.
+        threshold = np.minimum((self._inverse[0] - 1 / np.maximum(depth - AHEAD, 1e-6)) / self._inverse[1], 1)
+        outside = cv2.BORDER_CONSTANT
+        return cv2.remap(self._map, u, v, cv2.INTER_NEAREST, borderMode=outside, borderValue=1.0) >= threshold

@@ -17,7 +17,7 @@ import numpy as np
 
 from arm5dof.vision import shading
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.meshes import BOX, PLANE, Assembler, Solid
+from arm5dof.vision.meshes import BOX, PLANE, Assembler, Solid, room
 from arm5dof.vision.raster import Raster
 
 GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
@@ -48,7 +48,7 @@ class SoftwareRenderer:
 
     def __init__(self, model: mujoco.MjModel, camera: str, width: int, height: int) -> None:
         self.model, self.camera, self.width, self.height = model, camera, width, height
-        self._scene = mujoco.MjvScene(model, maxgeom=10_000)
+        self._scene = mujoco.MjvScene(model, maxgeom=room(model))
         self._option, self._viewer = mujoco.MjvOption(), mujoco.MjvCamera()
         self._viewer.type, self._viewer.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
         self._assembler = Assembler(model)
@@ -67,9 +67,9 @@ class SoftwareRenderer:
     def outlines(self, data: mujoco.MjData, groups: Sequence[np.ndarray]) -> list[int]:
         """How many pixels each group of geoms, given by their ids, would cover if nothing hid them and the picture
         had no edges. They must be in front of the camera and no planes."""
-        view = self._see(data)
-        ids = np.array(_ids(view.geoms))[view.solid.owner[view.solid.triangles[:, 0]]]
-        return [view.raster.outline(view.solid.triangles[np.isin(ids, group)]) for group in groups]
+        geoms, raster, solid = self._look(data)
+        ids = np.array(_ids(geoms))[solid.owner[solid.triangles[:, 0]]]
+        return [raster.outline(solid.triangles[np.isin(ids, group)]) for group in groups]
 
     def rgb(self, data: mujoco.MjData) -> np.ndarray:
         """The picture, (h, w, 3) uint8."""
@@ -109,23 +109,29 @@ class SoftwareRenderer:
         on_plane = np.array([geom.type == PLANE for geom in view.geoms] + [False])[view.owner]
         for light in (light for light in lights if light.shadow):
             lit = draw([light], 0, 0)
-            for which, receiver in ((~thrown_by_large, view.owner >= 0), (thrown_by_large, on_plane)):
+            for which, receiver, size in ((~thrown_by_large, view.owner >= 0, 512), (thrown_by_large, on_plane, 256)):
                 if which.any() and receiver.any():
                     crop, _ = _crop(receiver)
-                    shadow = shading.ShadowMap(light, solid.vertices, solid.triangles[which])
-                    lit[crop] *= shadow.light(points[crop])[..., None]
+                    shadow = shading.ShadowMap(light, solid.vertices, solid.triangles[which], size)
+                    lit[crop] *= shadow.reaches(points[crop])[..., None]
             picture += lit
         self._texture(view, points, picture)
-        return (np.minimum(picture, 1) * 255 + 0.5).astype(np.uint8)
+        return cv2.convertScaleAbs(picture, alpha=255)
 
-    def _see(self, data: mujoco.MjData) -> _View:
-        """Everything about the picture but its colours."""
+    def _look(self, data: mujoco.MjData) -> tuple[list[mujoco.MjvGeom], Raster, Solid]:
+        """What there is to draw, loaded into a raster."""
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, data, self._option, None, self._viewer, every, self._scene)
         geoms = list(self._scene.geoms[: self._scene.ngeom])
         near, far = (z * self.model.stat.extent for z in (self.model.vis.map.znear, self.model.vis.map.zfar))
         raster = Raster(Camera.from_mujoco(self.model, self.camera, self.width, self.height, data), near, far)
+        solid = self._assembler.solid(geoms)
+        raster.load(solid.vertices, solid.triangles)
+        return geoms, raster, solid
 
+    def _see(self, data: mujoco.MjData) -> _View:
+        """Everything about the picture but its colours."""
+        geoms, raster, solid = self._look(data)
         planes = np.ones(raster.shape, np.float32)
         owner = np.full((*raster.shape, 3), -1, np.float32)
         for g, geom in enumerate(geoms):
@@ -133,8 +139,6 @@ class SoftwareRenderer:
                 buffer = raster.meet(geom)
                 owner[buffer < planes] = g
                 planes = np.minimum(planes, buffer)
-        solid = self._assembler.solid(geoms)
-        raster.load(solid.vertices, solid.triangles)
         buffer = planes.copy()
         raster.draw(np.repeat(solid.owner[:, None], 3, 1), owner, buffer, flat=True)
         return _View(geoms, solid, raster, planes, owner[..., 0].astype(np.int32), buffer)
@@ -148,7 +152,7 @@ class SoftwareRenderer:
             colours = self._load(skies[0]).around(
                 view.raster.rays[crop][..., [0, 2, 1]] * np.array([1, 1, -1], np.float32)
             )
-            np.copyto(picture[crop], colours, where=sky)
+            cv2.copyTo(colours, sky, picture[crop])
         for g in np.flatnonzero(counts[1:]):
             geom = view.geoms[g]
             texture, repeat, uniform = geom.texid, geom.texrepeat, geom.texuniform
@@ -165,13 +169,13 @@ class SoftwareRenderer:
             if image.cube:
                 colours = image.around(local)
             else:
-                u, v = local[..., 0], local[..., 1]
-                if geom.type == BOX:
-                    axis = np.abs(local).argmax(-1)
-                    u, v = np.where(axis == 0, v, u), np.where(axis == 2, v, local[..., 2])
+                u, v, z = (local[..., axis] for axis in range(3))
+                side = np.abs(z) < 0.999
+                if geom.type == BOX and side.any():
+                    u, v = np.where(side & (np.abs(u) > np.abs(v)), v, u), np.where(side, z, v)
                 times = (repeat * (size[:2] if uniform else 1)).astype(np.float32) / 2
                 colours = image.flat(times[0] * (1 + u), times[1] * (1 - v))
-            np.multiply(picture[crop], colours, out=picture[crop], where=mask)
+            cv2.copyTo(cv2.multiply(picture[crop], colours), mask, picture[crop])
 
     def _load(self, texture: int) -> shading.Texture:
         if texture not in self._textures:
@@ -184,10 +188,10 @@ def _ids(geoms: list[mujoco.MjvGeom]) -> list[int]:
 
 
 def _crop(mask: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
-    """The rectangle that a mask (h, w) takes, and the mask in it, (h', w', 1)."""
+    """The rectangle that a mask (h, w) takes, and the mask in it, (h', w') uint8."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     crop = np.s_[top : top + height, left : left + width]
-    return crop, mask[crop][..., None]
+    return crop, mask.view(np.uint8)[crop]
 
 
 def _surface(
