@@ -204,7 +204,9 @@ def _parser() -> Parser:
     p.add_argument("--json", action="store_true", help="print a JSON list")
     p.set_defaults(run=solve)
 
-    vision.declare(commands.add_parser("vision", help="cameras: calibrate", description="What the arm sees."))
+    vision.declare(
+        commands.add_parser("vision", help="cameras: calibrate, detect, doctor", description="What the arm sees.")
+    )
     return parser
 
 

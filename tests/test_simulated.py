@@ -232,14 +232,3 @@ def test_a_broken_opengl_is_noticed_in_another_process_and_software_draws(tmp_pa
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[0] == "SoftwareRenderer"
     assert "status 7" in done.stdout
-
-
-@pytest.mark.parametrize("value", ["off", "disable"])
-def test_mujoco_gl_can_forbid_opengl(value, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", value)
-    assert gl.candidates() == ()
-
-
-def test_mujoco_gl_chooses(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    assert gl.candidates() == ("glfw",)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from arm5dof import files
 from arm5dof.errors import UserError
-from arm5dof.vision import detect_command
+from arm5dof.vision import detect_command, doctor_command
 
 if TYPE_CHECKING:
     from arm5dof.vision.boards import Board
@@ -70,6 +70,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     p.set_defaults(run=calibrate)
 
     detect_command.declare(commands)
+    doctor_command.declare(commands)
 
 
 def calibrate(known: argparse.Namespace, rest: list[str]) -> None:

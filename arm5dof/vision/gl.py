@@ -7,9 +7,9 @@ opened by name instead, at any time.
 
 from __future__ import annotations
 
+import ctypes.util
 import importlib
 import os
-import platform
 import subprocess
 import sys
 from functools import cache
@@ -25,8 +25,11 @@ from arm5dof.vision.meshes import room
 PROBE_S = 60.0
 """A probe that takes longer has failed."""
 
-NONE = ("disable", "disabled", "off", "false", "0")
-"""What MUJOCO_GL may say to forbid OpenGL."""
+FORBIDDEN = ("disable", "disabled", "off", "false", "0")
+"""What MUJOCO_GL may say against OpenGL."""
+
+SHARED = {"egl": "EGL", "osmesa": "OSMesa"}
+"""The system's shared library, where it takes one."""
 
 GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 
@@ -86,13 +89,17 @@ class GLRenderer:
         return np.ascontiguousarray(picture[::-1]), buffer[::-1]
 
 
+def known() -> tuple[str, ...]:
+    """The OpenGL libraries that MuJoCo can use on this system, best first."""
+    return {"linux": ("egl", "osmesa", "glfw"), "darwin": ("cgl", "glfw")}.get(sys.platform, ("glfw",))
+
+
 def candidates() -> tuple[str, ...]:
-    """The OpenGL libraries that may be tried here, best first: what MUJOCO_GL says, or all that the system can have."""
+    """Those of them that may be tried: what MUJOCO_GL says, or all."""
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if wanted in NONE:
+    if wanted in FORBIDDEN:
         return ()
-    known = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw")}.get(platform.system(), ("glfw",))
-    return (wanted,) if wanted in known else known
+    return (wanted,) if wanted in known() else known()
 
 
 @cache
@@ -104,17 +111,28 @@ def working() -> str | None:
 @cache
 def problem(library: str) -> str | None:
     """What goes wrong when a picture is drawn with a library, in a process of its own; None if it is drawn."""
-    clean = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    if library == "glfw" and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        return "there is no display"
+    _, wrong = alone("arm5dof.vision.gl", library)
+    shared = SHARED.get(library)
+    if wrong is not None and shared and ctypes.util.find_library(shared) is None:
+        return f"lib{shared} is not installed"
+    return wrong
+
+
+def alone(module: str, library: str) -> tuple[str, str | None]:
+    """What a module of ours prints when it is run in a process of its own, and what goes wrong there, None if
+    nothing does."""
+    clean = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     clean["PYTHONPATH"] = os.pathsep.join(filter(None, [str(files.PACKAGE.parent), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", "arm5dof.vision.gl", library]
+    command = [sys.executable, "-m", module, library]
     try:
-        probe = subprocess.run(command, env=clean, capture_output=True, text=True, timeout=PROBE_S, check=False)
+        done = subprocess.run(command, env=clean, capture_output=True, text=True, timeout=PROBE_S, check=False)
     except subprocess.TimeoutExpired:
-        return f"no answer within {PROBE_S:g} s"
-    if probe.returncode == 0:
-        return None
-    lines = probe.stderr.strip().splitlines()
-    return lines[-1].strip() if lines else f"the process ended with status {probe.returncode}"
+        return "", f"no answer within {PROBE_S:g} s"
+    said = done.stderr.strip().splitlines()
+    wrong = said[-1].strip() if said else f"the process ended with status {done.returncode}"
+    return done.stdout, wrong if done.returncode else None
 
 
 @cache
