@@ -19,9 +19,10 @@ from pathlib import Path
 # - The task in plain NumPy, all environments in one batch, costs next to nothing beside the updates.
 # - Cost of an update (sbx): width 256 costs three times 128, batch 256 four times 64; small ones learn faster by clock.
 # - gelu learns faster than relu; three layers of 128; one update for each transition.
-# - DDPG: step size 1e-3 before 3e-3. TD3 before DDPG at the same budget. SAC needs a small entropy coefficient.
+# - DDPG: step size 1e-3 before 3e-3. SAC needs a small entropy coefficient.
 # - Hindsight, with goals from the same episode: half as many updates again or fewer for the same accuracy, then
-#   accuracy goes up and down, which is what the falling step size is for.
+#   accuracy goes up and down, which is what the falling step size is for. DDPG ends at 94.6 % if it falls within
+#   100,000 updates.
 SBX = {
     "learning_rate": 1e-3,
     "gamma": 0.0,
@@ -51,7 +52,7 @@ REJAX = {
     "iterations_per_call": 20,
 }
 SETTINGS = {
-    "sbx-DDPG": {**SBX, "qf_learning_rate": None, "noise": 0.5},
+    "sbx-DDPG": {**SBX, "qf_learning_rate": None, "noise": 0.5, "decay_updates": 140_000},
     "sbx-TD3": {**SBX, "noise": 0.5, "policy_delay": 2},
     "sbx-SAC": {**SBX, "ent_coef": "auto_0.001"},
     "rejax-TD3": {**REJAX, "exploration_noise": 0.3, "policy_delay": 1},
