@@ -107,7 +107,7 @@ def _train(run: Run) -> list[dict[str, Any]]:
             )
             trainer.start()
         else:
-            trainer.start(checkpoints.restore(trainer.like))
+            trainer.state = checkpoints.restore(trainer.like)
             bar.say(f"resuming {run.folder} at episode {trainer.counters.episodes}")
         at = trainer.counters
         rows = _read_rows(run.metrics_file, at.steps)

@@ -53,8 +53,8 @@ class Settings(Protocol):
 class Trainer:
     """A compiled training program for one environment and configuration.
 
-    `state` is the whole run, made or gone on with by `start`; `advance` takes it one epoch further. Raises `UserError`
-    if the budget does not divide.
+    `state` is the whole run, made by `start` or restored from a checkpoint; `advance` takes it one epoch further.
+    Raises `UserError` if the budget does not divide.
     """
 
     state: Training
@@ -94,13 +94,11 @@ class Trainer:
                 f"{free / 1e9:.1f} GB are free: choose a smaller one"
             )
 
-    def start(self, state: Training | None = None) -> None:
-        """Begin a new run, or go on with a restored one."""
+    def start(self) -> None:
+        """Begin a new run."""
         self.check_memory()
         epoch = self._epoch  # Everything else is compiled while this is.
-        if state is None:
-            state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
-        self.state = state
+        self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
         self._policy_distance()
         epoch.result()
 
