@@ -36,7 +36,7 @@ def test_the_catalogue_is_what_compiles(thing):
 
     def surface(axis, sign):
         """Points (n, 3) that parallel rays along an axis meet first."""
-        grid = np.stack(np.meshgrid(*[np.linspace(-0.0301, 0.0301, 88)] * 2), -1).reshape(-1, 2)
+        grid = np.stack(np.meshgrid(*[np.linspace(-0.0301, 0.0301, 120)] * 2), -1).reshape(-1, 2)
         hit, points = np.zeros(1, np.int32), []
         for where in grid:
             start, ray = np.insert(where, axis, sign), -sign * np.eye(3)[axis]
@@ -70,13 +70,16 @@ def test_the_same_seed_gives_the_same_bits(seed, style):
 
 
 def test_styles_have_nothing_in_common():
-    assert not set(patterns.TRAINING) & set(patterns.EVALUATION)
+    first, second = ({*family.surfaces, *family.papers} for family in (patterns.TRAINING, patterns.EVALUATION))
+    assert not first & second
     for style, kind in (
         ("training", mujoco.mjtLightType.mjLIGHT_SPOT),
         ("evaluation", mujoco.mjtLightType.mjLIGHT_DIRECTIONAL),
     ):
         for seed in range(5):
             assert (random_scene(seed, style).model.light_type == kind).all()
+    with pytest.raises(UserError, match="seed is 0 or more, not -1"):
+        random_scene(-1)
     with pytest.raises(UserError, match="no style 'holiday': there are training and evaluation"):
         random_scene(0, "holiday")
 

@@ -1,4 +1,4 @@
-"""Random pictures for tables, floors and things: two families that have no pattern in common.
+"""Random pictures for tables, floors, things and paper: two families that have no pattern in common.
 
 Each takes a generator and a size and gives a picture, RGB uint8 (size, size, 3).
 """
@@ -6,6 +6,7 @@ Each takes a generator and a size and gives a picture, RGB uint8 (size, size, 3)
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -70,7 +71,7 @@ def weave(rng: np.random.Generator, size: int) -> np.ndarray:
     return _between(rng, 0.5 + 0.25 * (np.sin(i) + np.sin(j)) * np.sign(np.sin(i / 2) * np.sin(j / 2) + 1e-9))
 
 
-def print_(rng: np.random.Generator, size: int) -> np.ndarray:
+def text(rng: np.random.Generator, size: int) -> np.ndarray:
     """Printed paper: lines of dark words on white, and sometimes a figure."""
     page = np.full((size, size), 1.0)
     line = int(rng.integers(size // 32, size // 10))
@@ -87,8 +88,31 @@ def print_(rng: np.random.Generator, size: int) -> np.ndarray:
     return _mix(page, ink, paper)
 
 
-TRAINING: tuple[Pattern, ...] = (checker, clouds, planks, plain)
-EVALUATION: tuple[Pattern, ...] = (tiles, marble, granite, weave)
+def target(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Printed paper: rings round a middle."""
+    i, j = np.mgrid[:size, :size] / size - rng.uniform(0.3, 0.7, (2, 1, 1))
+    rings = np.sin(np.hypot(i, j) * rng.uniform(20, 90)) > rng.uniform(-0.7, 0.7)
+    return _mix(rings, colour(rng) * 0.4, np.full(3, rng.uniform(0.8, 1)))
+
+
+def bars(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Printed paper: bars of many widths, or a square code."""
+    cells = rng.random((1, 48) if rng.random() < 0.5 else (16, 16)) < 0.5
+    code = cv2.resize(cells.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST)
+    margin = size // 10
+    code[:margin] = code[-margin:] = code[:, :margin] = code[:, -margin:] = 1
+    return _mix(code, colour(rng) * 0.3, np.full(3, rng.uniform(0.8, 1)))
+
+
+class Family(NamedTuple):
+    """What surfaces look like, and what is printed on paper."""
+
+    surfaces: tuple[Pattern, ...]
+    papers: tuple[Pattern, ...]
+
+
+TRAINING = Family((checker, clouds, planks, plain), (text, checker))
+EVALUATION = Family((tiles, marble, granite, weave), (target, bars))
 
 
 def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -103,8 +127,9 @@ def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def _between(rng: np.random.Generator, share: np.ndarray, contrast: float = 1.0) -> np.ndarray:
-    """A random colour where `share` (size, size) is 0, and where it is 1 one that differs by `contrast`."""
-    first, second = colour(rng), colour(rng)
+    """A random colour where `share` (size, size) is 0, and where it is 1 one that differs by `contrast`; both are
+    duller than things may be."""
+    first, second = (0.7 * colour(rng) + 0.3 * rng.uniform(0.2, 0.9) for _ in range(2))
     return _mix(share, first, first + contrast * (second - first))
 
 

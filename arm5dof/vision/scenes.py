@@ -16,8 +16,8 @@ import numpy as np
 from arm5dof import files
 from arm5dof.errors import UserError
 from arm5dof.vision import patterns
-from arm5dof.vision.catalogue import BOX, CATALOGUE, CYLINDER, Part, Thing
-from arm5dof.vision.scenery import Builder, camera, lamps, other_shape
+from arm5dof.vision.catalogue import CATALOGUE, Thing
+from arm5dof.vision.scenery import Builder, other_shape
 
 Style = Literal["training", "evaluation"]
 """Which textures and lights: the two have no pattern and no kind of lamp in common."""
@@ -57,44 +57,35 @@ class Scene:
 
 
 def random_scene(seed: int | tuple[int, ...], style: Style = "training") -> Scene:
-    """The scene of a seed; a tuple, such as (run, number), is a seed too. The same seed gives the same bits."""
+    """The scene of a seed, 0 or more; a tuple, such as (run, number), is a seed too. The same seed gives the same bits.
+
+    The things are bodies called `thing 0`, `thing 1` and so on. Raises `UserError` for a negative seed or an unknown
+    style.
+    """
     if style not in get_args(Style):
         raise UserError(f"no style {style!r}: there are {' and '.join(get_args(Style))}")
+    if np.min(seed) < 0:
+        raise UserError(f"a scene's seed is 0 or more, not {seed}")
     rng = np.random.default_rng([get_args(Style).index(style), *np.atleast_1d(seed)])
-    spec = _arm_spec().copy()
-    builder = Builder(spec, rng, patterns.TRAINING if style == "training" else patterns.EVALUATION)
-
+    builder = Builder(_arm_spec().copy(), rng, patterns.TRAINING if style == "training" else patterns.EVALUATION)
     pose, obstacles = _arm_pose(rng)
     builder.paint_arm()
     builder.room()
     things = _place_things(builder, obstacles)
-    _place_others(builder, obstacles, [(p.position, p.thing.radius) for p in things])
-    lamps(spec, rng, style == "training")
-    camera(spec, rng)
+    _place_others(builder, obstacles, [(position, CATALOGUE[i].radius) for i, position, _ in things])
+    builder.paper()
+    builder.lamps(distant=style == "evaluation")
+    builder.camera()
 
-    model = spec.compile()
-    for name, picture in builder.pictures.items():
-        first = model.tex_adr[model.texture(name).id]
-        model.tex_data[first : first + picture.size] = picture.ravel()
+    model = builder.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     mujoco.mj_forward(model, data)
-    placed = tuple(
-        Placed(p.class_id, p.position, p.yaw, np.array([model.geom(name).id for name in p.names])) for p in things
+    placed = (
+        Placed(*thing, np.flatnonzero(model.geom_bodyid == model.body(f"thing {i}").id))
+        for i, thing in enumerate(things)
     )
-    return Scene(model, data, placed)
-
-
-@dataclass(frozen=True, eq=False)
-class _Lying:
-    class_id: int
-    position: np.ndarray
-    yaw: float
-    names: tuple[str, ...]
-
-    @property
-    def thing(self) -> Thing:
-        return CATALOGUE[self.class_id]
+    return Scene(model, data, tuple(placed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,53 +106,40 @@ class _Obstacles:
         return self.centres[:, 2] - (np.abs(self.axes[:, 2]) * self.halves).sum(-1)
 
 
-def _place_things(builder: Builder, obstacles: _Obstacles) -> list[_Lying]:
-    """Up to six things, apart from each other and from the arm."""
+def _place_things(builder: Builder, obstacles: _Obstacles) -> list[tuple[int, np.ndarray, float]]:
+    """Up to six things, apart from each other and from the arm: class ids, positions and yaws."""
     rng = builder.rng
-    lying: list[_Lying] = []
+    lying: list[tuple[int, np.ndarray, float]] = []
     for _ in range(rng.integers(0, MOST_THINGS + 1)):
         class_id = int(rng.integers(len(CATALOGUE)))
         thing = CATALOGUE[class_id]
         for _ in range(30):
             radius, angle = np.sqrt(rng.uniform(NEAREST**2, FARTHEST**2)), rng.uniform(-AROUND, AROUND)
             position = np.array([radius * np.cos(angle), radius * np.sin(angle), thing.half_height])
-            room = max(thing.radius, thing.half_height) + GAP
-            others = [np.linalg.norm(p.position[:2] - position[:2]) - p.thing.radius for p in lying]
-            if obstacles.distance(position) > room and min(others, default=1.0) > thing.radius + GAP:
+            others = [(other, CATALOGUE[i].radius) for i, other, _ in lying]
+            if _free(position, thing.radius, others, obstacles):
                 yaw = float(rng.uniform(-np.pi, np.pi))
-                body, material = builder.body(position, yaw), builder.thing_material(thing.hue)
-                names = tuple(builder.add(body, part, material) for part in thing.parts)
-                lying.append(_Lying(class_id, position, yaw, names))
+                builder.body(position, yaw, thing.parts, builder.paint(thing.hue), f"thing {len(lying)}")
+                lying.append((class_id, position, yaw))
                 break
     return lying
 
 
 def _place_others(builder: Builder, obstacles: _Obstacles, taken: list[tuple[np.ndarray, float]]) -> None:
-    """What the detector must not mistake for a thing: solid shapes, and paper lying flat."""
+    """Solid shapes that the detector must not mistake for things."""
     rng = builder.rng
     for _ in range(rng.integers(0, 6)):
-        parts, height, reach = other_shape(rng)
-        position = np.array([*rng.uniform([-0.25, -0.4], [0.4, 0.4]), height])
-        clear = min((np.linalg.norm(p[:2] - position[:2]) - r for p, r in taken), default=1.0) > reach + GAP
-        if clear and obstacles.distance(position) > max(reach, height) + GAP:
-            hue = float(rng.uniform(60, 150)) if reach < 0.018 else None
-            body, material = builder.body(position, rng.uniform(-np.pi, np.pi)), builder.thing_material(hue)
-            for part in parts:
-                builder.add(body, part, material)
-            taken.append((position, reach))
-    for layer in range(rng.integers(0, 5)):
-        thin = 0.0002 * (layer + 1)
-        size = rng.uniform(0.008, 0.08, 2) if rng.random() < 0.7 else np.repeat(rng.uniform(0.01, 0.03), 2)
-        kind = rng.random()
-        if kind < 0.4:
-            material = builder.material(patterns.print_)
-        elif kind < 0.6:
-            material = builder.material(patterns.checker)
-        else:
-            material = builder.material(None, patterns.colour(rng))
-        body = builder.body(np.array([*rng.uniform([-0.2, -0.35], [0.35, 0.35]), 0.0]), rng.uniform(-np.pi, np.pi))
-        disc = kind >= 0.6 and rng.random() < 0.4
-        builder.add(body, Part(CYLINDER, (size[0], thin)) if disc else Part(BOX, (*size, thin)), material)
+        parts, half_height, radius, hue = other_shape(rng)
+        position = np.array([*rng.uniform([-0.25, -0.4], [0.4, 0.4]), half_height])
+        if _free(position, radius, taken, obstacles):
+            builder.body(position, rng.uniform(-np.pi, np.pi), parts, builder.paint(hue))
+            taken.append((position, radius))
+
+
+def _free(position: np.ndarray, radius: float, taken: list[tuple[np.ndarray, float]], obstacles: _Obstacles) -> bool:
+    """Whether something of that radius can stand there."""
+    apart = all(np.linalg.norm((other - position)[:2]) > radius + r + GAP for other, r in taken)
+    return apart and obstacles.distance(position) > max(radius, position[2]) + GAP
 
 
 @cache
