@@ -7,6 +7,7 @@ measured with one library.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 import time
@@ -25,7 +26,10 @@ from arm5dof.vision.software import SoftwareRenderer
 from arm5dof.vision.yolov5_layers import Conv
 
 WIDTH, HEIGHT = 320, 240
+SIZE = f"{WIDTH} x {HEIGHT}"
 SCENES = 3
+
+OPENCV = "pip uninstall opencv-python opencv-python-headless; pip install 'opencv-python-headless>=5'"
 
 INSTALL = {
     "apt-get": {"egl": "apt-get install libegl1 libgl1", "osmesa": "apt-get install libosmesa6"},
@@ -59,18 +63,26 @@ def rendering(broken: str | None = None) -> Iterator[Finding]:
     cannot be imported with it."""
     if broken is not None:
         yield Finding(f"MUJOCO_GL={broken}", False, "MuJoCo cannot be imported with it", "unset MUJOCO_GL")
-    camera, data = _software(0)
-    size = f"{WIDTH} x {HEIGHT}"
-    yield Finding("software", True, f"{_milliseconds(lambda: camera.rgb(data)):.0f} ms a picture of {size}")
+    yield _software()
     for library in gl.known():
         yield _opengl(library)
-    yield Finding("chosen", True, f"OpenGL by {gl.working()}" if gl.working() else "software")
+    said = f" (MUJOCO_GL={os.environ['MUJOCO_GL']})" if "MUJOCO_GL" in os.environ else ""
+    yield Finding("chosen", True, (f"OpenGL by {gl.working()}" if gl.working() else "software") + said)
 
 
 def detectors() -> Iterator[Finding]:
     """What can detect, one by one as it is found out."""
     yield _yolov5()
     yield _onnx()
+
+
+def _software() -> Finding:
+    scene = random_scene(0)
+    camera = SoftwareRenderer(scene.model, CAMERA, WIDTH, HEIGHT)
+    try:
+        return Finding("software", True, f"{_milliseconds(lambda: camera.rgb(scene.data)):.0f} ms a picture of {SIZE}")
+    except (AttributeError, cv2.error) as error:  # Another OpenCV hides ours, or has overwritten it.
+        return Finding("software", False, f"OpenCV {cv2.__version__}: {' '.join(str(error).split())}", OPENCV)
 
 
 def _opengl(library: str) -> Finding:
@@ -110,13 +122,8 @@ def _onnx() -> Finding:
             raise ValueError("its sums are wrong")
     except (cv2.error, ValueError) as error:
         reason = " ".join(str(error).split())
-        return Finding(what, False, f"{detail}: {reason}", "pip install --upgrade 'opencv-python-headless>=5'")
+        return Finding(what, False, f"{detail}: {reason}", OPENCV)
     return Finding(what, True, detail)
-
-
-def _software(number: int) -> tuple[SoftwareRenderer, object]:
-    scene = random_scene(number)
-    return SoftwareRenderer(scene.model, CAMERA, WIDTH, HEIGHT), scene.data
 
 
 def _milliseconds(run: Callable[[], object]) -> float:

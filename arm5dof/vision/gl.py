@@ -20,7 +20,7 @@ import numpy as np
 
 from arm5dof import files
 from arm5dof.errors import UserError
-from arm5dof.vision.meshes import room
+from arm5dof.vision.meshes import capacity
 
 PROBE_S = 60.0
 """A probe that takes longer has failed."""
@@ -42,7 +42,7 @@ class GLRenderer:
 
     def __init__(self, model: mujoco.MjModel, camera: str, width: int, height: int, library: str) -> None:
         self.model, self.width, self.height = model, width, height
-        self._scene = mujoco.MjvScene(model, maxgeom=room(model))
+        self._scene = mujoco.MjvScene(model, maxgeom=capacity(model))
         self._option, self._viewer = mujoco.MjvOption(), mujoco.MjvCamera()
         self._viewer.type, self._viewer.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
         self._window = _window(library)

@@ -21,8 +21,8 @@ LARGE = 0.1
 """Half width, in metres, from which a box's faces are divided: light falls on a smaller one much the same all over."""
 
 
-def room(model: mujoco.MjModel) -> int:
-    """How many geoms an abstract scene of a model may hold; room for many more takes MuJoCo milliseconds to make."""
+def capacity(model: mujoco.MjModel) -> int:
+    """How many geoms an abstract scene of a model must have room for; room for thousands costs milliseconds."""
     return model.ngeom + model.nsite + 2 * model.nwrap + model.nflex + model.nskin + 100
 
 

@@ -18,32 +18,36 @@ class Raster:
 
     def __init__(self, camera: Camera, near: float, far: float) -> None:
         self.shape = (camera.height, camera.width)
-        rotation, self.eye = np.asarray(camera.rotation, np.float32), np.asarray(camera.position, np.float32)
+        self.eye = np.asarray(camera.position, np.float32)
         self._near, self._far = near, far
+        self._rotation = np.asarray(camera.rotation, np.float32)
         (fx, _, cx), (_, fy, cy) = camera.matrix[:2]
-        x, y = (np.arange(camera.width) - cx) / fx, (np.arange(camera.height) - cy) / fy
-        plane = cv2.merge([*np.meshgrid(x.astype(np.float32), y.astype(np.float32)), np.ones(self.shape, np.float32)])
-        self.rays = np.asarray(cv2.transform(plane, rotation))
-        """From the eye to a depth of 1 metre, (h, w, 3) float32, base frame."""
+        self._x = np.asarray((np.arange(camera.width) - cx) / fx, np.float32)
+        self._y = np.asarray((np.arange(camera.height) - cy) / fy, np.float32)[:, None]
         # The rasteriser's camera is OpenGL's, with square pixels and the principal point in the middle.
-        self._axes = rotation * np.array([fx / fy, -1, -1], np.float32)
+        self._axes = self._rotation * np.array([fx / fy, -1, -1], np.float32)
         self._field = 2 * np.arctan(camera.height / 2 / fy)
 
     def depth(self, buffer: np.ndarray) -> np.ndarray:
         """Metres along the optical axis, from a depth buffer."""
         return 1 / ((1 - buffer) * np.float32(1 / self._near) + buffer * np.float32(1 / self._far))
 
+    def points(self, depth: np.ndarray) -> np.ndarray:
+        """What is seen at some depth (h, w) in metres, (h, w, 3), base frame."""
+        seen = cv2.merge([self._x * depth, self._y * depth, depth])
+        return np.asarray(cv2.transform(seen, np.c_[self._rotation, self.eye]))
+
     def meet(self, plane: mujoco.MjvGeom) -> np.ndarray:
         """A depth buffer with nothing but a plane in it, seen from its front."""
-        offset = self.eye - plane.pos
-        height, sinking = offset @ plane.mat[:, 2], -(self.rays @ plane.mat[:, 2])
-        inverse = sinking / max(height, 1e-9)
+        offset = (self.eye - plane.pos) @ plane.mat
+        # How fast a ray goes along the plane's axes: affine in the pixel.
+        along = [self._x * x + (self._y * y + z) for x, y, z in (self._rotation.T @ plane.mat).T]
+        inverse = -along[2] / max(offset[2], 1e-9)
         buffer = (1 / self._near - inverse) / (1 / self._near - 1 / self._far)
-        met = (inverse > 0) & (buffer > 0) & (buffer < 1) & (height > 0)
+        met = (inverse > 0) & (buffer > 0) & (buffer < 1) & (offset[2] > 0)
         for axis in (0, 1):
             if plane.size[axis] > 0:
-                along = (self.rays @ plane.mat[:, axis]) + (offset @ plane.mat[:, axis]) * inverse
-                met &= np.abs(along) <= plane.size[axis] * inverse
+                met &= np.abs(along[axis] + offset[axis] * inverse) <= plane.size[axis] * inverse
         return np.where(met, buffer, 1).astype(np.float32)
 
     def load(self, vertices: np.ndarray, triangles: np.ndarray) -> None:

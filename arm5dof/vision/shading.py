@@ -35,6 +35,8 @@ class Surface(NamedTuple):
     """(n, 3)."""
     gloss: np.ndarray
     """Specular reflection and shininess (n, 2)."""
+    glow: np.ndarray
+    """What it shows without any light, (n, 3)."""
 
 
 class Light(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 
 from arm5dof.vision import shading
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.meshes import BOX, PLANE, Assembler, Solid, room
+from arm5dof.vision.meshes import BOX, PLANE, Assembler, Solid, capacity
 from arm5dof.vision.raster import Raster
 
 GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
@@ -48,7 +48,7 @@ class SoftwareRenderer:
 
     def __init__(self, model: mujoco.MjModel, camera: str, width: int, height: int) -> None:
         self.model, self.camera, self.width, self.height = model, camera, width, height
-        self._scene = mujoco.MjvScene(model, maxgeom=room(model))
+        self._scene = mujoco.MjvScene(model, maxgeom=capacity(model))
         self._option, self._viewer = mujoco.MjvOption(), mujoco.MjvCamera()
         self._viewer.type, self._viewer.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
         self._assembler = Assembler(model)
@@ -74,47 +74,15 @@ class SoftwareRenderer:
     def rgb(self, data: mujoco.MjData) -> np.ndarray:
         """The picture, (h, w, 3) uint8."""
         view = self._see(data)
-        raster, solid, eye = view.raster, view.solid, view.raster.eye
-        points = eye + raster.rays * raster.depth(view.buffer)[..., None]
+        points = view.raster.points(view.raster.depth(view.buffer))
         lights = shading.lights(self._scene)
-        everywhere = NO_LIGHT * (not lights)
-        body = _surface(view.geoms, solid.owner, solid.vertices, solid.normals)
-        emission = np.array([geom.emission for geom in view.geoms], np.float32)
-        planes = []
-        for g, geom in enumerate(view.geoms):
-            if geom.type == PLANE and (mask := view.owner == g).any():
-                normals = np.broadcast_to(geom.mat[:, 2], (int(mask.sum()), 3))
-                planes.append(
-                    (mask, _surface(view.geoms, np.full(len(normals), g), points[mask], normals), emission[g])
-                )
-
-        def draw(some: list[shading.Light], base: float, glow: float) -> np.ndarray:
-            """The picture in some of the lights, and what there is without: `base` everywhere, `glow` of what glows."""
-
-            def colours(surface: shading.Surface, own: np.ndarray) -> np.ndarray:
-                total = (base + glow * own) * surface.rgb
-                for light in some:
-                    total = total + shading.lit(surface, light, eye)
-                return np.minimum(total, 1)
-
-            picture = np.zeros((*raster.shape, 3), np.float32)
-            raster.draw(colours(body, emission[solid.owner, None]), picture, view.planes.copy())
-            for mask, surface, own in planes:
-                picture[mask] = colours(surface, own)
-            return picture
-
-        picture = draw([light for light in lights if not light.shadow], everywhere, 1)
-        large = np.array([geom.type == BOX and geom.size.max() > FURNITURE for geom in view.geoms], bool)
-        thrown_by_large = large[solid.owner[solid.triangles[:, 0]]]
-        on_plane = np.array([geom.type == PLANE for geom in view.geoms] + [False])[view.owner]
-        for light in (light for light in lights if light.shadow):
-            lit = draw([light], 0, 0)
-            for which, receiver, size in ((~thrown_by_large, view.owner >= 0, 512), (thrown_by_large, on_plane, 256)):
-                if which.any() and receiver.any():
-                    crop, _ = _crop(receiver)
-                    shadow = shading.ShadowMap(light, solid.vertices, solid.triangles[which], size)
-                    lit[crop] *= shadow.reaches(points[crop])[..., None]
-            picture += lit
+        surfaces = _surfaces(view, points, 0 if lights else NO_LIGHT)
+        picture = _draw(view, surfaces, [light for light in lights if not light.shadow], glowing=True)
+        for light in lights:
+            if light.shadow:
+                lit = _draw(view, surfaces, [light], glowing=False)
+                _shade(view, points, light, lit)
+                picture += lit
         self._texture(view, points, picture)
         return cv2.convertScaleAbs(picture, alpha=255)
 
@@ -133,15 +101,17 @@ class SoftwareRenderer:
         """Everything about the picture but its colours."""
         geoms, raster, solid = self._look(data)
         planes = np.ones(raster.shape, np.float32)
-        owner = np.full((*raster.shape, 3), -1, np.float32)
+        behind = np.full(raster.shape, -1, np.int32)
         for g, geom in enumerate(geoms):
             if geom.type == PLANE:
                 buffer = raster.meet(geom)
-                owner[buffer < planes] = g
+                behind[buffer < planes] = g
                 planes = np.minimum(planes, buffer)
         buffer = planes.copy()
-        raster.draw(np.repeat(solid.owner[:, None], 3, 1), owner, buffer, flat=True)
-        return _View(geoms, solid, raster, planes, owner[..., 0].astype(np.int32), buffer)
+        front = np.full((*raster.shape, 3), -1, np.float32)
+        raster.draw(np.repeat(solid.owner[:, None], 3, 1), front, buffer, flat=True)
+        owner = front[..., 0].astype(np.int32)
+        return _View(geoms, solid, raster, planes, np.where(owner < 0, behind, owner), buffer)
 
     def _texture(self, view: _View, points: np.ndarray, picture: np.ndarray) -> None:
         """Multiply a picture by the textures of what is seen, and put the sky behind it."""
@@ -149,10 +119,9 @@ class SoftwareRenderer:
         skies = np.flatnonzero(self.model.tex_type == SKY)
         if counts[0] and len(skies):
             crop, sky = _crop(view.owner == -1)
-            colours = self._load(skies[0]).around(
-                view.raster.rays[crop][..., [0, 2, 1]] * np.array([1, 1, -1], np.float32)
-            )
-            cv2.copyTo(colours, sky, picture[crop])
+            upright = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+            towards = cv2.transform(points[crop] - view.raster.eye, upright)
+            cv2.copyTo(self._load(skies[0]).around(towards), sky, picture[crop])
         for g in np.flatnonzero(counts[1:]):
             geom = view.geoms[g]
             texture, repeat, uniform = geom.texid, geom.texrepeat, geom.texuniform
@@ -194,9 +163,50 @@ def _crop(mask: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
     return crop, mask.view(np.uint8)[crop]
 
 
-def _surface(
-    geoms: list[mujoco.MjvGeom], owner: np.ndarray, points: np.ndarray, normals: np.ndarray
-) -> shading.Surface:
-    rgb = np.array([geom.rgba[:3] for geom in geoms], np.float32).reshape(-1, 3)
-    gloss = np.array([(geom.specular, geom.shininess) for geom in geoms], np.float32).reshape(-1, 2)
-    return shading.Surface(points, normals, rgb[owner], gloss[owner])
+def _surfaces(view: _View, points: np.ndarray, everywhere: float) -> list[tuple[np.ndarray | None, shading.Surface]]:
+    """What is to be lit: the vertices of the solid, then the pixels (a mask of the picture) that show a plane."""
+    rgb = np.array([geom.rgba[:3] for geom in view.geoms], np.float32).reshape(-1, 3)
+    gloss = np.array([(geom.specular, geom.shininess) for geom in view.geoms], np.float32).reshape(-1, 2)
+    glow = np.array([[geom.emission + everywhere] for geom in view.geoms], np.float32).reshape(-1, 1) * rgb
+    solid, owner = view.solid, view.solid.owner
+    found: list[tuple[np.ndarray | None, shading.Surface]] = [
+        (None, shading.Surface(solid.vertices, solid.normals, rgb[owner], gloss[owner], glow[owner]))
+    ]
+    for g, geom in enumerate(view.geoms):
+        if geom.type == PLANE and (mask := view.owner == g).any():
+            inside = points[mask]
+            alike = (np.broadcast_to(a, (len(inside), len(a))) for a in (geom.mat[:, 2], rgb[g], gloss[g], glow[g]))
+            found.append((mask, shading.Surface(inside, *alike)))
+    return found
+
+
+def _draw(
+    view: _View,
+    surfaces: list[tuple[np.ndarray | None, shading.Surface]],
+    lights: list[shading.Light],
+    glowing: bool,
+) -> np.ndarray:
+    """A picture (h, w, 3) float32, without textures, in some of the lights, and in the surfaces' own if `glowing`."""
+    picture = np.zeros((*view.raster.shape, 3), np.float32)
+    for mask, surface in surfaces:
+        colours = surface.glow if glowing else np.zeros_like(surface.glow)
+        for light in lights:
+            colours = colours + shading.lit(surface, light, view.raster.eye)
+        colours = np.minimum(colours, 1)
+        if mask is None:
+            view.raster.draw(colours, picture, view.planes.copy())
+        else:
+            picture[mask] = colours
+    return picture
+
+
+def _shade(view: _View, points: np.ndarray, light: shading.Light, picture: np.ndarray) -> None:
+    """Make a picture in one light black where the light does not come."""
+    large = np.array([geom.type == BOX and geom.size.max() > FURNITURE for geom in view.geoms], bool)
+    large = large[view.solid.owner[view.solid.triangles[:, 0]]]
+    plane = np.array([geom.type == PLANE for geom in view.geoms] + [False])[view.owner]
+    for which, receiver, size in ((~large, view.owner >= 0, 512), (large, plane, 256)):
+        if which.any() and receiver.any():
+            crop, _ = _crop(receiver)
+            shadow = shading.ShadowMap(light, view.solid.vertices, view.solid.triangles[which], size)
+            picture[crop] = cv2.copyTo(picture[crop], shadow.reaches(points[crop]).view(np.uint8))
