@@ -42,9 +42,11 @@ def test_models_and_experiments_are_found_from_an_installed_wheel(wheel, tmp_pat
     ]
 
 
-def test_wheel_carries_no_test_data(wheel):
+def test_wheel_carries_all_experiments_and_neither_results_nor_test_data(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert not [name for name in names if name.endswith((".pt", ".onnx", ".jpg"))]
+    experiments = {path.name for path in (ROOT / "experiments").glob("*.toml")}
+    assert {Path(name).name for name in names if "/experiments/" in name} == experiments
     assert wheel.stat().st_size < 500_000
 
 
