@@ -141,10 +141,12 @@ def _describe(leaves: dict[str, Any]) -> dict[str, Any]:
 def _as_user_error(message: str) -> Iterator[None]:
     """Orbax and tensorstore raise many types for a bad file or a full disk; to the user they are one.
 
-    After one failure the rest of tensorstore's threads fail too, each with a traceback about its closed event loop.
+    After one failure the rest of tensorstore's threads fail too, each with a traceback: about its closed event loop, or
+    by asyncio because nobody waits for it any more.
     """
-    report = sys.unraisablehook
+    report, asyncio = sys.unraisablehook, logging.getLogger("asyncio")
     sys.unraisablehook = lambda failure: None if "loop is closed" in str(failure.exc_value) else report(failure)
+    asyncio.addFilter(_is_awaited)
     try:
         yield
     except UserError:
@@ -155,3 +157,8 @@ def _as_user_error(message: str) -> Iterator[None]:
         raise UserError(f"{message} ({reason})") from error
     else:
         sys.unraisablehook = report
+        asyncio.removeFilter(_is_awaited)
+
+
+def _is_awaited(record: logging.LogRecord) -> bool:
+    return "exception was never retrieved" not in record.getMessage()

@@ -1,6 +1,8 @@
 """The command line: what it does, and what it says of bad input: one line on stderr, exit status 2, nothing lost."""
 
+import asyncio
 import csv
+import gc
 import hashlib
 import json
 import os
@@ -15,7 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from arm5dof import arm, cli
+from arm5dof import arm, checkpoint, cli
 from arm5dof.checkpoint import Checkpoints
 from arm5dof.errors import UserError
 from arm5dof.run import Run, free_folder, make_trainer
@@ -323,6 +325,24 @@ sys.exit(cli.main(sys.argv[1:]))
     assert len(lines) == 1 and "--resume" in lines[0] and "Traceback" not in done.stderr
     assert run("train", "--resume", folder) == 0
     assert json.loads((folder / "evaluations.json").read_text())[-1]["episodes"] == 4
+
+
+def test_failures_that_nobody_waits_for_are_silent(caplog, capfd):
+    """After a first write has failed, tensorstore's others may or may not fail in time for someone to ask."""
+
+    async def write():
+        raise OSError("File too large")
+
+    async def give_up():
+        task = asyncio.ensure_future(write())
+        await asyncio.sleep(0.01)
+        del task
+        gc.collect()
+
+    with pytest.raises(UserError, match="cannot write"), checkpoint._as_user_error("cannot write"):
+        asyncio.run(give_up())
+        raise OSError("File too large")
+    assert not caplog.records and not capfd.readouterr().err
 
 
 def test_help_lists_every_setting(capsys):
