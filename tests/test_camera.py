@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
 
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Camera
@@ -126,8 +127,28 @@ def test_what_cannot_be_seen_is_nan():
     barrel = camera.replace(distortion=np.array([-0.3, 0, 0, 0]))
     focal, centre = camera.matrix[0, 0], camera.matrix[:2, 2]
     assert np.isfinite(barrel.rays(centre + np.array([0.69 * focal, 0]))).all()
-    assert np.isnan(barrel.rays(centre + np.array([0.71 * focal, 0]))).all()
-    assert np.isnan(barrel.undistort(centre + np.array([0.71 * focal, 0]))).all()
+    for beyond in (0.71, 1, 1.7, 3):
+        assert np.isnan(barrel.rays(centre + np.array([beyond * focal, 0]))).all()
+        assert np.isnan(barrel.undistort(centre + np.array([beyond * focal, 0]))).all()
+
+
+@given(SEEDS, st.sampled_from([4, 5, 8]))
+def test_disturbed_cameras_are_as_opencv_and_scipy_make_them(seed, coefficients):
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng, coefficients)
+    lens, turn, shift = rng.normal(size=4), 0.01 * rng.normal(size=3), 0.01 * rng.normal(size=3)
+    bent = 0.01 * rng.normal(size=coefficients)
+    other = camera.disturbed(np.concatenate([lens, bent, turn, shift]))
+    points, _ = points_in_view(rng, camera)
+    matrix = camera.matrix + np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 0]])
+    rotation = camera.rotation @ Rotation.from_rotvec(turn).as_matrix()
+    position = camera.position + camera.rotation @ shift
+    to_camera, _ = cv2.Rodrigues(rotation.T)
+    expected, _ = cv2.projectPoints(points, to_camera, -rotation.T @ position, matrix, camera.distortion + bent)
+    np.testing.assert_allclose(other.project(points), expected[:, 0], atol=0.02)
+    # What the turn leaves out is of the third order.
+    np.testing.assert_allclose(other.rotation, rotation, atol=np.linalg.norm(turn) ** 3)
+    np.testing.assert_allclose(other.position, position, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [0, 3, 6, 12, 14])
@@ -216,13 +237,34 @@ def test_files_lose_nothing(coefficients, tmp_path):
     camera.save(tmp_path / "camera.yml", {"avg_reprojection_error": 0.2, "board": "9x6"})
     again = Camera.load(tmp_path / "camera.yml")
     jax.tree.map(np.testing.assert_array_equal, camera, again)
-    assert again.posed
+    assert again.posed and again.covariance is None
     storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_READ)
     assert storage.getNode("image_width").real() == WIDTH
     assert (storage.getNode("camera_matrix").mat() == camera.matrix).all()
     assert (storage.getNode("distortion_coefficients").mat().ravel() == camera.distortion).all()
     camera.replace(posed=False).save(tmp_path / "bare.yml")
     assert not Camera.load(tmp_path / "bare.yml").posed
+
+
+def test_files_keep_the_covariance_and_the_pose_on_a_hand(tmp_path):
+    rng = np.random.default_rng(6)
+    camera = random_camera(rng, 5)
+    factor = rng.normal(size=(15, 15)) * np.array([*[0.5] * 4, *[0.01] * 5, *[1e-4] * 6])
+    known = camera.replace(covariance=factor.T @ factor)
+    known.save(tmp_path / "known.yml")
+    np.testing.assert_array_equal(Camera.load(tmp_path / "known.yml").covariance, known.covariance)
+
+    notes = {"hand_rotation": camera.rotation, "hand_position": camera.position.reshape(3, 1)}
+    known.replace(posed=False).save(tmp_path / "hand.yml", notes)
+    assert not Camera.load(tmp_path / "hand.yml").posed
+    hand = np.eye(4)
+    hand[:3, :3], hand[:3, 3] = Rotation.from_rotvec([0.3, -1, 2]).as_matrix(), [0.2, 0.1, 0.3]
+    posed = Camera.load(tmp_path / "hand.yml", hand)
+    assert posed.posed and (posed.covariance == known.covariance).all()
+    np.testing.assert_allclose(posed.rotation, hand[:3, :3] @ camera.rotation, atol=1e-15)
+    np.testing.assert_allclose(posed.position, hand[:3, :3] @ camera.position + hand[:3, 3], atol=1e-15)
+    with pytest.raises(UserError, match="has no hand_rotation: this camera was not calibrated on a hand"):
+        Camera.load(tmp_path / "known.yml", hand)
 
 
 def test_files_that_are_no_cameras_are_one_line(tmp_path):
@@ -270,6 +312,9 @@ def test_files_that_are_no_cameras_are_one_line(tmp_path):
         ({"camera_rotation": np.diag([1, 1, -1.0])}, "no rotation matrix"),
         ({"camera_rotation": 1.001 * np.eye(3)}, "no rotation matrix"),
         ({"camera_position": None}, "no camera_position"),
+        ({"camera_covariance": np.eye(14)}, "no camera_covariance"),
+        ({"camera_covariance": -np.eye(15)}, "no covariance matrix"),
+        ({"camera_covariance": np.tri(15)}, "no covariance matrix"),
     ]:
         write(**changes)
         assert expected in said()

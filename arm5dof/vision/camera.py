@@ -51,6 +51,8 @@ class Camera(struct.PyTreeNode):
     posed: bool = struct.field(pytree_node=False, default=True)
     """False if nobody has said where the camera stands: `rotation` and `position` are then those of the camera's own
     frame, and what is computed from them is in that frame."""
+    covariance: Array | None = None
+    """How well all that is known, (m, m), in the order in which `disturbed` takes errors; None if nobody has said."""
 
     def __post_init__(self) -> None:
         # Transformations build cameras out of whatever they put in place of arrays; only arrays have a shape to check.
@@ -64,6 +66,21 @@ class Camera(struct.PyTreeNode):
     def with_pose(self, rotation: Array, position: Array) -> Camera:
         """This camera at another place: `rotation` (3, 3) camera to base, `position` (3,) metres."""
         return self.replace(rotation=rotation, position=position, posed=True)
+
+    @jax.jit
+    def disturbed(self, error: Array) -> Camera:
+        """This camera with an `error` (m,) in each of its parameters: fx, fy, cx, cy (pixels), the distortion, then a
+        small turn about its own axes (3,) (radians, to the second order) and a shift along them (3,) (metres)."""
+        lens, turn, shift = jnp.split(jnp.asarray(error), [len(error) - 6, len(error) - 3])
+        (fx, fy, cx, cy), (x, y, z), o = lens[:4], turn, 0.0
+        turn = jnp.array([[o, -z, y], [z, o, -x], [-y, x, o]])
+        change = _matmul(turn, jnp.eye(3) + turn / 2)
+        return self.replace(
+            matrix=self.matrix + jnp.array([[fx, o, cx], [o, fy, cy], [o, o, o]]),
+            distortion=self.distortion + lens[4:],
+            rotation=self.rotation + _matmul(jnp.asarray(self.rotation), change),
+            position=self.position + _matmul(shift, jnp.asarray(self.rotation).T),
+        )
 
     @jax.jit
     def to_camera(self, points: Array) -> jax.Array:
@@ -119,7 +136,9 @@ class Camera(struct.PyTreeNode):
         plane = self._newton(jax.lax.stop_gradient(start), target)
         error = jnp.linalg.norm(self._distort(plane) - target, axis=-1, keepdims=True)
         tolerance = 1e-5 * (1 + jnp.linalg.norm(target, axis=-1, keepdims=True))
-        return jnp.where(error < tolerance, plane, jnp.nan)
+        # Past where a barrel distortion folds back, the way back leads to the other side of the picture.
+        ahead = jnp.sum(plane * target, axis=-1, keepdims=True) >= 0
+        return jnp.where((error < tolerance) & ahead, plane, jnp.nan)
 
     def _newton(self, plane: jax.Array, target: jax.Array) -> jax.Array:
         """One Newton step from `plane` towards the point that `_distort` takes to `target`, (..., 2) each."""
@@ -177,9 +196,11 @@ class Camera(struct.PyTreeNode):
         )
 
     @classmethod
-    def load(cls, path: str | Path) -> Camera:
-        """Read a camera from a YAML file in the format of OpenCV's calibration sample; ours adds the pose, and a file
-        without one gives a camera that is not `posed`. Raises `UserError` for anything else."""
+    def load(cls, path: str | Path, hand: np.ndarray | None = None) -> Camera:
+        """Read a camera from a YAML file in the format of OpenCV's calibration sample; ours adds the pose and the
+        covariance, and a file without a pose gives a camera that is not `posed`. A camera that was calibrated on the
+        hand has its pose there; it takes the pose of the `hand` in the base frame, (4, 4), to be `posed`. Raises
+        `UserError` for anything else."""
         path = Path(path)
         values = _read(path)
         matrix = _array(path, values, "camera_matrix", (3, 3))
@@ -189,12 +210,24 @@ class Camera(struct.PyTreeNode):
         if distortion.size not in COEFFICIENTS:
             raise UserError(f"{path} has {distortion.size} distortion_coefficients: 4, 5 or 8 can be used")
         width, height = (_whole(path, values, name) for name in ("image_width", "image_height"))
-        posed = "camera_rotation" in values
-        rotation = _array(path, values, "camera_rotation", (3, 3)) if posed else np.eye(3)
+        place = "camera" if hand is None else "hand"
+        posed = f"{place}_rotation" in values
+        if hand is not None and not posed:
+            raise UserError(f"{path} has no hand_rotation: this camera was not calibrated on a hand")
+        rotation = _array(path, values, f"{place}_rotation", (3, 3)) if posed else np.eye(3)
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
-            raise UserError(f"{path}: camera_rotation is no rotation matrix")
-        position = _array(path, values, "camera_position", (3,)) if posed else np.zeros(3)
-        return cls(matrix, distortion, rotation, position, width, height, posed)
+            raise UserError(f"{path}: {place}_rotation is no rotation matrix")
+        position = _array(path, values, f"{place}_position", (3,)) if posed else np.zeros(3)
+        if hand is not None:
+            rotation, position = hand[:3, :3] @ rotation, hand[:3, :3] @ position + hand[:3, 3]
+        covariance = None
+        if "camera_covariance" in values:
+            covariance = _array(path, values, "camera_covariance", 2 * (10 + distortion.size,))
+            scale = np.sqrt(np.abs(np.diag(covariance)))
+            scaled = covariance / np.maximum(np.outer(scale, scale), 1e-30)
+            if np.abs(scaled - scaled.T).max() > 1e-6 or np.linalg.eigvalsh(scaled)[0] < -1e-6:
+                raise UserError(f"{path}: camera_covariance is no covariance matrix")
+        return cls(matrix, distortion, rotation, position, width, height, posed, covariance)
 
     def save(self, path: str | Path, notes: Mapping[str, Any] | None = None) -> None:
         """Write the camera, and any `notes` (numbers, words, arrays), where `load` and OpenCV can read them."""
@@ -208,6 +241,8 @@ class Camera(struct.PyTreeNode):
         if self.posed:
             values["camera_rotation"] = np.asarray(self.rotation, float)
             values["camera_position"] = np.asarray(self.position, float).reshape(3, 1)
+        if self.covariance is not None:
+            values["camera_covariance"] = np.asarray(self.covariance, float)
         for name, value in {**values, **(notes or {})}.items():
             storage.write(name, value)
         files.write_text(Path(path), storage.releaseAndGetString())
