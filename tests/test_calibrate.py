@@ -1,6 +1,5 @@
 """Calibration: OpenCV's photographs against OpenCV's published calibration, and boards drawn through known cameras."""
 
-import functools
 import json
 import subprocess
 import sys
@@ -8,12 +7,13 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from photographs import TRUE, draw, photograph, poses
 
 from arm5dof import cli
 from arm5dof.errors import UserError
 from arm5dof.vision import boards
 from arm5dof.vision.boards import Charuco, Checkerboard, Corners
-from arm5dof.vision.calibrate import MIN_VIEWS, View, calibrate, extrinsics, find_views, fit, preview
+from arm5dof.vision.calibrate import MIN_VIEWS, View, calibrate, find_views, fit, preview
 from arm5dof.vision.camera import Camera
 
 BOARD = Checkerboard(9, 6, 0.025)
@@ -157,62 +157,6 @@ def test_pictures_without_a_board(tmp_path):
         find_views(paths, BOARD)
 
 
-TRUE = Camera(
-    matrix=np.array([[700, 0, 321.5], [0, 705, 236], [0, 0, 1.0]]),
-    distortion=np.array([-0.2, 0.05, 1e-3, -5e-4, 0]),
-    rotation=np.eye(3),
-    position=np.zeros(3),
-    width=640,
-    height=480,
-)
-
-
-OVERSAMPLING = 2
-
-
-@functools.cache
-def rays():
-    """Where the true camera's pixels, and those between them, look on the plane at depth 1, (h, w, 2)."""
-    u, v = (np.arange(OVERSAMPLING * n) for n in (TRUE.width, TRUE.height))
-    pixels = (np.stack(np.meshgrid(u, v), -1) + 0.5) / OVERSAMPLING - 0.5
-    plane = cv2.undistortPoints(pixels.reshape(-1, 1, 2), TRUE.matrix, TRUE.distortion)
-    return plane.reshape(pixels.shape)
-
-
-def photograph(drawing, metres_per_pixel, origin, pose):
-    """What the true camera sees of a drawing whose pixel `origin` is the board's origin, at the board's pose (4, 4)
-    in the camera's frame."""
-    homography = np.linalg.inv(np.c_[pose[:3, :2], pose[:3, 3]])
-    place = rays() @ homography[:, :2].T + homography[:, 2]
-    place = (place[..., :2] / place[..., 2:] / metres_per_pixel + origin).astype(np.float32)
-    picture = cv2.remap(drawing, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=200)
-    return cv2.resize(picture, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
-
-
-def poses(rng, n, middle, distance=0.5):
-    """Board poses (4, 4) in front of the camera, tilted by up to 40 degrees."""
-    for _ in range(n):
-        turn, _ = cv2.Rodrigues(np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1)]))
-        pose = np.eye(4)
-        pose[:3, :3] = turn
-        at = np.array([*rng.uniform(-0.06, 0.06, 2), distance * rng.uniform(0.9, 1.3)])
-        pose[:3, 3] = at - turn @ [*middle, 0]
-        yield pose
-
-
-def draw(board):
-    """A drawing, its metres per pixel, and the pixel of the board's origin."""
-    scale = 24
-    if isinstance(board, Charuco):
-        picture = board.opencv.generateImage((scale * board.columns, scale * board.rows), marginSize=0)
-        return picture, board.square / scale, np.array([scale - 0.5, scale - 0.5])
-    squares = np.indices((board.rows + 1, board.columns + 1)).sum(0) % 2 * 255
-    picture = cv2.copyMakeBorder(
-        np.kron(squares, np.ones((scale, scale))).astype(np.uint8), *[scale] * 4, cv2.BORDER_CONSTANT, value=255
-    )
-    return picture, board.square / scale, np.array([2 * scale - 0.5, 2 * scale - 0.5])
-
-
 @pytest.mark.parametrize("board", [Charuco(8, 6, 0.03, 0.022), Checkerboard(8, 5, 0.03)], ids=str)
 def test_drawn_boards_give_the_camera_they_were_drawn_through(board, tmp_path):
     drawing, rng = draw(board), np.random.default_rng(0)
@@ -227,36 +171,6 @@ def test_drawn_boards_give_the_camera_they_were_drawn_through(board, tmp_path):
     true = [700, 705, 321.5, 236, *TRUE.distortion[:4]]
     assert np.abs(result.intrinsics[:4] - true[:4]).max() < 1.5
     assert (np.abs(result.intrinsics - true) < 5 * result.deviations + 1e-3).all()
-
-
-@pytest.mark.parametrize("board", [Charuco(8, 6, 0.03, 0.022), Checkerboard(8, 5, 0.03)], ids=str)
-@pytest.mark.parametrize("turn", [0.3, 2.9])
-def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
-    """The board lies on the table, upright or upside down in the picture; the camera's pose comes out the same."""
-    pose = next(poses(np.random.default_rng(1), 1, (0.1, 0.06)))
-    spin = np.eye(4)
-    spin[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    middle = np.eye(4)
-    middle[:2, 3] = 0.1, 0.06
-    pose = pose @ middle @ spin @ np.linalg.inv(middle)
-    path = tmp_path / "board.png"
-    cv2.imwrite(str(path), photograph(*draw(board), pose))
-    board_to_base = np.array([[0, 1, 0, 0.2], [1, 0, 0, 0.1], [0, 0, -1, 0], [0, 0, 0, 1.0]])
-    camera = extrinsics(TRUE, path, board, board_to_base)
-    expected = board_to_base @ np.linalg.inv(pose)
-    np.testing.assert_allclose(camera.position, expected[:3, 3], atol=1e-3)
-    np.testing.assert_allclose(camera.rotation, expected[:3, :3], atol=3e-3)
-    assert camera.posed and camera.position[2] > 0.3
-
-    with pytest.raises(UserError, match="640x480 pixels and the camera 320x240"):
-        extrinsics(TRUE.replace(width=320, height=240), path, board, board_to_base)
-    with pytest.raises(UserError, match="does not show the 6x9 checkerboard"):
-        extrinsics(TRUE, path, Checkerboard(6, 9, 0.025), board_to_base)
-    with pytest.raises(UserError, match="after half a turn"):
-        extrinsics(TRUE, path, Checkerboard(9, 7, 0.025), board_to_base)
-    wrong = TRUE.replace(distortion=np.array([3.0, 0, 0, 0, 0]))
-    with pytest.raises(UserError, match="is this the camera that was calibrated"):
-        extrinsics(wrong, path, board, board_to_base)
 
 
 @pytest.mark.parametrize("order", [np.s_[:, :], np.s_[::-1], np.s_[:, ::-1], np.s_[::-1, ::-1]], ids=str)

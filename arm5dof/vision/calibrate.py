@@ -1,4 +1,4 @@
-"""Calibration of a camera from photographs of a board: its lens, and where it stands.
+"""Calibration of a camera from photographs of a board.
 
 A small reprojection error alone proves nothing: a single photograph fits better than thirteen do, with a focal length
 that is wrong by half. So a calibration is judged by the standard deviations of what it estimated, and by how many
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
-from arm5dof.vision import images
+from arm5dof.vision import images, uncertainty
 from arm5dof.vision.boards import Board, Corners
 from arm5dof.vision.camera import Camera
 
@@ -91,7 +91,7 @@ def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str
     sizes: dict[str, tuple[int, int]] = {}
     found, without, notes = [], [], []
     for i, (path, name) in enumerate(zip(paths, names(paths), strict=True)):
-        grey = _read_grey(path)
+        grey = read_grey(path)
         sizes[name] = grey.shape[1], grey.shape[0]
         corners = board.find(grey)
         notes.append(board.inspect(grey, corners))
@@ -122,7 +122,7 @@ def calibrate(views: Views, coefficients: int = 5) -> Calibration:
         worst = max(kept, key=lambda view: result.errors[view.name])
         rest = [view for view in kept if view is not worst]
         without = fit(rest, views.size, coefficients)
-        if _error(without.camera, worst.corners) <= OUTLIER * float(np.median(list(without.errors.values()))):
+        if board_error(without.camera, worst.corners) <= OUTLIER * float(np.median(list(without.errors.values()))):
             break
         kept, result = rest, without
         outliers.append(worst)
@@ -135,7 +135,9 @@ def calibrate(views: Views, coefficients: int = 5) -> Calibration:
     _check_different(kept, views.size)
     _check_agreement(kept, result)
     _check_deviations(result)
-    return replace(result, outliers={view.name: _error(result.camera, view.corners) for view in outliers})
+    seen = [view.corners for view in kept]
+    camera = uncertainty.with_intrinsics(result.camera, seen, [board_pose(result.camera, corners) for corners in seen])
+    return replace(result, camera=camera, outliers={view.name: board_error(camera, view.corners) for view in outliers})
 
 
 def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, flags: int = 0) -> Calibration:
@@ -169,31 +171,6 @@ def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
     return pose
 
 
-def extrinsics(camera: Camera, path: Path, board: Board, board_to_base: np.ndarray) -> Camera:
-    """The camera with its pose, from one photograph of a board whose pose (4, 4) in the base frame is known. Raises
-    `UserError` if the board is not seen, leaves its own pose open, or does not fit the camera's intrinsics."""
-    grey = _read_grey(path)
-    if grey.shape != (camera.height, camera.width):
-        raise UserError(
-            f"{path} has {grey.shape[1]}x{grey.shape[0]} pixels and the camera {camera.width}x{camera.height}: take it "
-            "as the calibration's photographs were taken"
-        )
-    if board.turns:
-        raise UserError(
-            f"the {board} looks the same after half a turn: take one with an odd and an even number of corners, or a "
-            "ChArUco board"
-        )
-    corners = board.find(grey)
-    if corners is None:
-        mismatch = board.mismatch([board.inspect(grey, None)])
-        raise UserError(f"{path} does not show the {board}; {mismatch or 'is it seen whole, in focus?'}")
-    error = _error(camera, corners)
-    if error > 2:
-        raise UserError(f"{path}: the board is off by {error:.1f} pixels: is this the camera that was calibrated?")
-    camera_to_base = board_to_base @ np.linalg.inv(board_pose(camera, corners))
-    return camera.with_pose(camera_to_base[:3, :3], camera_to_base[:3, 3])
-
-
 def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
     """A photograph as it is and, beside it, without its lens distortion, as an image file of the kind `suffix`."""
     picture = cv2.cvtColor(images.read(path), cv2.COLOR_RGB2BGR)
@@ -205,7 +182,7 @@ def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
 
 
-def _error(camera: Camera, corners: Corners) -> float:
+def board_error(camera: Camera, corners: Corners) -> float:
     """Root mean square reprojection error of a view with the best pose, pixels."""
     pose = board_pose(camera, corners)
     turn, _ = cv2.Rodrigues(pose[:3, :3])
@@ -287,7 +264,7 @@ def names(paths: Sequence[Path]) -> list[str]:
     return [path.name if count[path.name] == 1 else str(path) for path in paths]
 
 
-def _read_grey(path: Path) -> np.ndarray:
+def read_grey(path: Path) -> np.ndarray:
     """A photograph in grey, (h, w), uint8."""
     content = np.frombuffer(path.read_bytes(), np.uint8)
     picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None

@@ -46,9 +46,15 @@ class HandEye:
     """Root mean square of what is left between the board's poses measured and explained: rotation, degrees."""
     translation_m: float
     """The same of translation, metres."""
-    deviations: np.ndarray
-    """Standard deviations of the camera's pose, judged by what is left, (6,): rotation about the camera's x, y and z
-    axes in degrees, position in metres."""
+    covariance: np.ndarray
+    """Of the camera's pose, judged by what is left, (6, 6): a turn about the camera's x, y and z axes in radians, a
+    shift along them in metres."""
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations of the camera's pose, (6,): of the turn in degrees, of the shift in metres."""
+        deviations = np.sqrt(np.diag(self.covariance))
+        return np.concatenate([np.rad2deg(deviations[:3]), deviations[3:]])
 
 
 def eye_in_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> HandEye:
@@ -90,13 +96,12 @@ def _solve(robot: np.ndarray, boards: np.ndarray) -> HandEye:
         )
     system = (jacobian * weights[:, None]).reshape(-1, 12)
     variance = np.square(residual * weights).sum() / (residual.size - 12)
-    deviations = np.sqrt(np.diag(np.linalg.inv(system.T @ system))[:6] * variance)
     return HandEye(
         camera=x,
         board=z,
         rotation_deg=float(np.rad2deg(rotation)),
         translation_m=translation,
-        deviations=np.concatenate([np.rad2deg(deviations[:3]), deviations[3:]]),
+        covariance=np.linalg.inv(system.T @ system)[:6, :6] * variance,
     )
 
 

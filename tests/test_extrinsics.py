@@ -1,0 +1,89 @@
+"""Where cameras stand: boards drawn at known places and held by a known hand."""
+
+import cv2
+import numpy as np
+import pytest
+from photographs import TRUE, draw, photograph, poses
+from scipy.spatial.transform import Rotation
+
+from arm5dof.errors import UserError
+from arm5dof.vision.boards import Charuco, Checkerboard
+from arm5dof.vision.extrinsics import from_board, from_hand
+
+KNOWN = TRUE.replace(covariance=np.diag(np.square([0.5, 0.5, 0.5, 0.5, *[1e-3] * 5, *[0] * 6])))
+
+BOARD = Checkerboard(8, 5, 0.03)
+
+
+@pytest.mark.parametrize("board", [Charuco(8, 6, 0.03, 0.022), Checkerboard(8, 5, 0.03)], ids=str)
+@pytest.mark.parametrize("turn", [0.3, 2.9])
+def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
+    """The board lies on the table, upright or upside down in the picture; the camera's pose comes out the same."""
+    pose = next(poses(np.random.default_rng(1), 1, (0.1, 0.06)))
+    spin = np.eye(4)
+    spin[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    middle = np.eye(4)
+    middle[:2, 3] = 0.1, 0.06
+    pose = pose @ middle @ spin @ np.linalg.inv(middle)
+    path = tmp_path / "board.png"
+    cv2.imwrite(str(path), photograph(*draw(board), pose))
+    board_to_base = np.array([[0, 1, 0, 0.2], [1, 0, 0, 0.1], [0, 0, -1, 0], [0, 0, 0, 1.0]])
+    camera = from_board(TRUE, path, board, board_to_base)
+    expected = board_to_base @ np.linalg.inv(pose)
+    np.testing.assert_allclose(camera.position, expected[:3, 3], atol=1e-3)
+    np.testing.assert_allclose(camera.rotation, expected[:3, :3], atol=3e-3)
+    assert camera.posed and camera.position[2] > 0.3
+
+    with pytest.raises(UserError, match="640x480 pixels and the camera 320x240"):
+        from_board(TRUE.replace(width=320, height=240), path, board, board_to_base)
+    with pytest.raises(UserError, match="does not show the 6x9 checkerboard"):
+        from_board(TRUE, path, Checkerboard(6, 9, 0.025), board_to_base)
+    with pytest.raises(UserError, match="after half a turn"):
+        from_board(TRUE, path, Checkerboard(9, 7, 0.025), board_to_base)
+    wrong = TRUE.replace(distortion=np.array([3.0, 0, 0, 0, 0]))
+    with pytest.raises(UserError, match="is this the camera that was calibrated"):
+        from_board(wrong, path, board, board_to_base)
+
+
+def matrix(rotation, position):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
+
+
+CAMERA = matrix(Rotation.from_euler("xyz", [0.4, -0.3, 1.1]), [0.05, -0.02, 0.04])
+"""On the hand, or beside the arm."""
+
+OTHER = matrix(Rotation.from_euler("xyz", [0.2, 0.1, -0.5]), [0.3, 0.1, 0.02])
+"""The board's pose, where it lies or in the hand."""
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """Photographs of a board, and its poses (4, 4) in the camera's frame; the last shows none."""
+    folder, rng = tmp_path_factory.mktemp("shots"), np.random.default_rng(3)
+    seen = list(poses(rng, 10, (0.1, 0.06)))
+    paths = [folder / f"{i}.png" for i in range(len(seen) + 1)]
+    for path, pose in zip(paths, seen, strict=False):
+        cv2.imwrite(str(path), photograph(*draw(BOARD), pose))
+    cv2.imwrite(str(paths[-1]), np.full((480, 640), 128, np.uint8))
+    return paths, np.array([*seen, seen[0]])
+
+
+def hands(seen, on_hand):
+    """The hand's poses (n, 4, 4) at which the camera sees the board so."""
+    return OTHER @ np.linalg.inv(CAMERA @ seen) if on_hand else CAMERA @ seen @ np.linalg.inv(OTHER)
+
+
+@pytest.mark.parametrize("on_hand", [True, False])
+def test_a_moving_hand_tells_where_the_camera_is(shots, on_hand):
+    paths, seen = shots
+    told = []
+    found = from_hand(KNOWN, hands(seen, on_hand), paths, BOARD, on_hand, lambda done, name: told.append((done, name)))
+    np.testing.assert_allclose(found.camera.position, CAMERA[:3, 3], atol=2e-3)
+    np.testing.assert_allclose(found.camera.rotation, CAMERA[:3, :3], atol=5e-3)
+    assert found.without == [paths[-1].name] and len(found.used) == len(paths) - 1
+    assert told[-1] == (len(paths), paths[-1].name) and found.camera.posed
+    # The pose's own deviations, and on top of them what those of the intrinsics do to it.
+    with_lens = np.sqrt(np.diag(found.camera.covariance)[-6:])
+    assert (with_lens > np.sqrt(np.diag(found.hand_eye.covariance))).all() and (with_lens < 0.01).all()
