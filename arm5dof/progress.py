@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 from rich.console import Console
 from rich.progress import (
@@ -19,6 +21,9 @@ from rich.progress import (
 from rich.text import Text
 
 LINE_EVERY_S = 10.0
+
+PATIENCE_S = 2.0
+"""What takes less needs no bar."""
 
 
 class Bar:
@@ -72,6 +77,22 @@ class Bar:
     def say(self, line: str) -> None:
         """Print a line above the bar."""
         self._console.print(line, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def late_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], None]]:
+    """A function that takes how much is done and a note; there is a bar only once that has gone on for two seconds."""
+    started, bar = time.monotonic(), None
+    with ExitStack() as stack:
+
+        def update(done: int, note: str) -> None:
+            nonlocal bar
+            if bar is None and time.monotonic() - started > PATIENCE_S:
+                bar = stack.enter_context(Bar(what, total, unit))
+            if bar is not None:
+                bar.update(done, note)
+
+        yield update
 
 
 class _Rate(ProgressColumn):

@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arm5dof import files
-from arm5dof.errors import UserError
-from arm5dof.vision import detect_command, doctor_command
+from arm5dof.vision import (
+    detect_command,
+    doctor_command,
+    hand_eye_command,
+    options,
+    pose_command,
+)
 
 if TYPE_CHECKING:
-    from arm5dof.vision.boards import Board
     from arm5dof.vision.calibrate import Calibration, Views
-
-BAR_AFTER_S = 2.0
 
 CALIBRATE_HELP = """\
 Calibrate a camera from photographs of a board.
@@ -51,12 +51,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "calibrate", help="calibrate a camera from photographs", description=CALIBRATE_HELP, formatter_class=raw
     )
     p.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="photographs, or folders of them")
-    p.add_argument(
-        "--board", type=_board_size, required=True, metavar="9x6", help="inner corners; with --charuco: squares"
-    )
-    p.add_argument("--square", type=float, required=True, metavar="METRES", help="the side of a square")
-    p.add_argument("--charuco", type=float, metavar="METRES", help="a ChArUco board with markers of this side")
-    p.add_argument("--dictionary", metavar="NAME", help="of the ChArUco board's markers; default DICT_5X5_100")
+    options.add_board(p)
     p.add_argument(
         "--distortion",
         type=int,
@@ -69,24 +64,27 @@ def declare(parser: argparse.ArgumentParser) -> None:
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=calibrate)
 
+    pose_command.declare(commands)
+    hand_eye_command.declare(commands)
     detect_command.declare(commands)
     doctor_command.declare(commands)
 
 
 def calibrate(known: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision calibrate`."""
-    if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof vision calibrate --help)")
-    _writable(known.out, (".yml", ".yaml"))
+    options.nothing_left(rest, "calibrate")
+    options.writable(known.out, (".yml", ".yaml"))
     if known.preview is not None:
-        _writable(known.preview, (".png", ".jpg"))
+        options.writable(known.preview, (".png", ".jpg"))
 
+    from arm5dof.progress import late_bar
     from arm5dof.vision import calibrate as calibration
     from arm5dof.vision.sources import image_files
 
     paths = image_files(known.images)
-    board = _board(known)
-    views = _watched(paths, board)
+    board = options.board(known)
+    with late_bar("looking for the board", len(paths), "photographs") as progress:
+        views = calibration.find_views(paths, board, progress)
     result = calibration.calibrate(views, known.distortion)
     used = next(path for path, name in zip(paths, calibration.names(paths), strict=True) if name in result.errors)
     notes = {
@@ -140,49 +138,3 @@ def as_json(views: Views, result: Calibration) -> dict[str, Any]:
         "outliers_px": result.outliers,
         "without_board": views.without,
     }
-
-
-def _watched(paths: list[Path], board: Board) -> Views:
-    """Look for the board, with a progress bar if that takes long enough to want one."""
-    from arm5dof.progress import Bar
-    from arm5dof.vision.calibrate import find_views
-
-    started, bar = time.monotonic(), None
-    with ExitStack() as stack:
-
-        def progress(done: int, name: str) -> None:
-            nonlocal bar
-            if bar is None and time.monotonic() - started > BAR_AFTER_S:
-                bar = stack.enter_context(Bar("looking for the board", len(paths), "photographs"))
-            if bar is not None:
-                bar.update(done, name)
-
-        return find_views(paths, board, progress)
-
-
-def _board(known: argparse.Namespace) -> Board:
-    from arm5dof.vision.boards import Charuco, Checkerboard
-
-    columns, rows = known.board
-    if known.charuco is not None:
-        return Charuco(columns, rows, known.square, known.charuco, known.dictionary or "DICT_5X5_100")
-    if known.dictionary is not None:
-        raise UserError("--dictionary belongs to a ChArUco board: give the side of its markers with --charuco")
-    return Checkerboard(columns, rows, known.square)
-
-
-def _board_size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
-    if match is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size of a board: give inner corners such as 9x6")
-    return int(match[1]), int(match[2])
-
-
-def _writable(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Say what is wrong with an output's name before the work begins."""
-    if path.suffix.lower() not in suffixes:
-        raise UserError(f"{path}: the name must end in {' or '.join(suffixes)}")
-    if path.exists():
-        raise UserError(f"{path} exists: choose another name")
-    if not path.parent.is_dir():
-        raise UserError(f"no folder {str(path.parent)!r} to write {path.name} into")
