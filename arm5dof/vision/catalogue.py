@@ -38,6 +38,8 @@ class Thing:
     """Of a circle round it as seen from above, metres."""
     hue: float | None = None
     """In degrees, for things told by their colour; None for those of any colour."""
+    form: str = "block"
+    """How its outline changes with height: see `solid.Solid`."""
 
 
 def _cube(name: str, hue: float) -> Thing:
@@ -63,7 +65,7 @@ def _ring(radius: float, thickness: float, half_height: float, sides: int = 12) 
 CATALOGUE = (
     _cube("red cube", 0.0),
     _cube("blue cube", 220.0),
-    Thing("ball", (Part(SPHERE, (0.015,)),), 0.015, 0.015),
+    Thing("ball", (Part(SPHERE, (0.015,)),), 0.015, 0.015, form="ball"),
     Thing("can", (Part(CYLINDER, (0.0125, 0.02)),), 0.02, 0.0125),
     Thing("brick", (Part(BOX, (0.02, 0.01, 0.01)),), 0.01, 0.0224),
     Thing("ring", _ring(0.02, 0.01, 0.008), 0.008, 0.0207),
@@ -77,6 +79,7 @@ CATALOGUE = (
         ),
         0.011,
         0.028,
+        form="ball",
     ),
 )
 """A detection's class id is a place in here."""
