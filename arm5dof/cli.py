@@ -205,7 +205,7 @@ def _parser() -> Parser:
     p.set_defaults(run=solve)
 
     vision.declare(
-        commands.add_parser("vision", help="cameras: calibrate, pose, detect, doctor", description="What the arm sees.")
+        commands.add_parser("vision", help="cameras: calibrate, pose, detect, locate", description="What the arm sees.")
     )
     return parser
 

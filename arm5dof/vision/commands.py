@@ -16,6 +16,7 @@ from arm5dof.vision import (
     detect_command,
     doctor_command,
     hand_eye_command,
+    locate_command,
     options,
     pose_command,
 )
@@ -67,6 +68,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     pose_command.declare(commands)
     hand_eye_command.declare(commands)
     detect_command.declare(commands)
+    locate_command.declare(commands)
     doctor_command.declare(commands)
 
 
