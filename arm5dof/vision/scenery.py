@@ -8,7 +8,7 @@ import numpy as np
 from arm5dof.vision import patterns
 from arm5dof.vision.catalogue import ALONG_X, BOX, CYLINDER, Part
 
-CAMERA = "camera"
+CAMERA, SECOND = "camera", "second camera"
 TEXTURE = 128
 """Width of a texture, pixels."""
 
@@ -93,7 +93,7 @@ class Builder:
             light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL if distant else mujoco.mjtLightType.mjLIGHT_SPOT
             light.cutoff, light.exponent = u(40, 70), u(0, 10)
 
-    def camera(self) -> None:
+    def camera(self, name: str) -> None:
         """0.6 to 0.9 m away, from overhead to 35 degrees above the table, on the side that the arm works on."""
         u = self.rng.uniform
         azimuth, elevation = u(-1.9, 1.9), np.arcsin(u(np.sin(np.deg2rad(35)), 1))
@@ -103,7 +103,7 @@ class Builder:
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, np.stack([x, y, back], 1).ravel())
         position = np.array([0.12, 0.0, 0.01]) + self.rng.normal(0, 0.02, 3) + u(0.6, 0.9) * back
-        self._spec.worldbody.add_camera(name=CAMERA, pos=position, quat=quaternion, fovy=u(32, 42))
+        self._spec.worldbody.add_camera(name=name, pos=position, quat=quaternion, fovy=u(32, 42))
 
     def _add(self, body: mujoco.MjsBody, part: Part, material: str) -> None:
         size, place = [*part.size, *[0.0] * (3 - len(part.size))], {"pos": part.position, "quat": part.quaternion}

@@ -17,7 +17,7 @@ from arm5dof import files
 from arm5dof.errors import UserError
 from arm5dof.vision import patterns
 from arm5dof.vision.catalogue import CATALOGUE, Thing
-from arm5dof.vision.scenery import Builder, other_shape
+from arm5dof.vision.scenery import CAMERA, SECOND, Builder, other_shape
 
 Style = Literal["training", "evaluation"]
 """Which textures and lights: the two have no pattern and no kind of lamp in common."""
@@ -49,7 +49,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A model with a camera called `camera`, its data after `mj_forward`, and the things in it."""
+    """A model with the cameras `camera` and `second camera`, its data after `mj_forward`, and the things in it."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -75,7 +75,8 @@ def random_scene(seed: int | tuple[int, ...], style: Style = "training") -> Scen
     _place_others(builder, obstacles, [(position, CATALOGUE[i].radius) for i, position, _ in things])
     builder.paper()
     builder.lamps(distant=style == "evaluation")
-    builder.camera()
+    builder.camera(CAMERA)
+    builder.camera(SECOND)
 
     model = builder.compile()
     data = mujoco.MjData(model)

@@ -43,14 +43,14 @@ class Truth:
         return self.visible >= VISIBLE
 
 
-def truth(scene: Scene, segmentation: np.ndarray) -> Truth:
-    """What there is to find, given the ids of the geoms seen in each pixel (h, w)."""
+def truth(scene: Scene, segmentation: np.ndarray, camera: str = CAMERA) -> Truth:
+    """What there is to find, given the ids of the geoms that a camera sees in each pixel (h, w)."""
     owner = np.full(scene.model.ngeom + 1, -1)
     for i, placed in enumerate(scene.things):
         owner[placed.geoms] = i
     seen = owner[segmentation]
     height, width = segmentation.shape
-    whole = SoftwareRenderer(scene.model, CAMERA, width, height).outlines(scene.data, [p.geoms for p in scene.things])
+    whole = SoftwareRenderer(scene.model, camera, width, height).outlines(scene.data, [p.geoms for p in scene.things])
     boxes, shares, found = [], [], []
     for i in range(len(scene.things)):
         mask = (seen == i).view(np.uint8)
