@@ -19,6 +19,7 @@ from yolov5_bytes import Architecture
 
 from arm5dof import cli, progress
 from arm5dof.errors import UserError
+from arm5dof.vision.catalogue import CLASS_NAMES
 from arm5dof.vision.detect import detect, load, read_names
 from arm5dof.vision.detect_command import _interruptible
 from arm5dof.vision.detections import Detections
@@ -162,6 +163,16 @@ def test_a_folder(photos, model, tmp_path, capsys):
     assert "3 frames in" in said and "3 ball" in said and f"written: {out}" in said
     assert list((tmp_path / "new").iterdir()) == [out], "nothing temporary is left"
     assert out.stat().st_mode & 0o777 == photos.stat().st_mode & 0o777
+
+
+def test_random_scenes_with_what_ships(tmp_path, capsys):
+    assert command("simulated:2", "--out", tmp_path / "found") == 0
+    frames = json.loads((tmp_path / "found" / "detections.json").read_text())
+    assert [frame["name"] for frame in frames] == ["scene0.png", "scene1.png"]
+    assert {box["class_name"] for frame in frames for box in frame["detections"]} <= set(CLASS_NAMES)
+    assert sum(len(frame["detections"]) for frame in frames) > 0
+    assert read(tmp_path / "found" / "scene1.png").shape == (480, 640, 3)
+    assert "2 frames" in capsys.readouterr().out
 
 
 def test_two_photographs_of_one_name(photos, model, tmp_path):
@@ -312,7 +323,8 @@ def test_bad_input_is_one_line(photos, clip, model, tmp_path, capfd):
         said = capfd.readouterr()
         assert said.err.startswith("arm5dof: ") and expected in said.err and said.err.count("\n") == 1, said.err
         assert said.out == "" and sorted(tmp_path.rglob("*")) == before, expected
-    assert command(photo) == 2 and "--detector" in capfd.readouterr().err
+    assert command(photo, "--names", tmp_path / "three.txt") == 2 and "are fixed" in capfd.readouterr().err
+    assert command("simulated:0") == 2 and "ask for one or more" in capfd.readouterr().err
 
 
 def test_yolov8_weights_are_refused_with_a_remedy(tmp_path):

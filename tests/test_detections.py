@@ -89,6 +89,13 @@ def test_suppression_keeps_the_best_of_each_class(seed, n, threshold):
     np.testing.assert_array_equal(again.xyxy, found.xyxy)
 
 
+def test_suppression_across_classes_keeps_the_best_of_all():
+    boxes, scores = np.array([[5, 5, 4, 4], [5, 5, 4, 5], [50, 5, 4, 4]]), np.array([[0.6, 0], [0, 0.9], [0.7, 0]])
+    assert len(suppress(boxes, scores, ("cube", "ball"), 0.25, 0.45)) == 3
+    found = suppress(boxes, scores, ("cube", "ball"), 0.25, 0.45, across=True)
+    np.testing.assert_array_equal(found.class_id, [1, 0])
+
+
 def test_suppression_of_nothing_of_flat_boxes_and_of_too_many():
     assert len(suppress(np.empty((0, 4)), np.empty((0, 3)), NAMES, 0.25, 0.45)) == 0
     flat = np.array([[5, 5, 0, 3], [5, 5, 3, -1]])

@@ -22,7 +22,7 @@ def test_says_what_works(capsys):
         assert line["works"] == (gl.problem(library) is None)
         assert line["works"] or line["remedy"]
     assert rendering["chosen"]["detail"] == (f"OpenGL by {gl.working()}" if gl.working() else "software")
-    assert all(line["works"] for line in report["detectors"]) and len(report["detectors"]) >= 2
+    assert all(line["works"] for line in report["detectors"]) and len(report["detectors"]) >= 3
 
 
 def test_a_choice_that_mujoco_cannot_be_imported_with_is_named_and_left_out():

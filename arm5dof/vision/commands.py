@@ -19,6 +19,7 @@ from arm5dof.vision import (
     locate_command,
     options,
     pose_command,
+    train_command,
 )
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     hand_eye_command.declare(commands)
     detect_command.declare(commands)
     locate_command.declare(commands)
+    train_command.declare(commands)
     doctor_command.declare(commands)
 
 

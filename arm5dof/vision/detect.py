@@ -12,31 +12,36 @@ import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from arm5dof import files
 from arm5dof.errors import UserError
 from arm5dof.vision.detections import Detections, Detector, check_known
 from arm5dof.vision.sources import Frame
 
+SHIPPED = files.PACKAGE / "vision" / "tabletop.npz"
+"""Weights of the tabletop detector."""
+
 
 def load(
-    path: str | Path,
+    path: str | Path | None = None,
     class_names: Sequence[str] | None = None,
     confidence: float = 0.25,
     iou: float = 0.45,
     size: int | None = None,
 ) -> Detector:
-    """The detector in a file: YOLOv5's own weights (`.pt`), or a network of the YOLO family as ONNX (`.onnx`). A file
-    called otherwise is told by its content.
+    """The detector in a file: YOLOv5's own weights (`.pt`), a network of the YOLO family as ONNX (`.onnx`), or weights
+    of the tabletop detector (`.npz`). A file called otherwise is told by its content. Without one, what ships.
 
     class_names: names of the network's classes; without them, those in the file
     confidence:  detections below are dropped
     iou:         of boxes of one class that overlap more, the best stays
     size:        side of the network's input in pixels; without it the file's, or 640 where that leaves it open
 
-    Raises `UserError` if the file is neither, is damaged, or tells apart another number of classes than are named.
+    The tabletop detector takes neither names nor a size. Raises `UserError` if the file is none of these, is damaged,
+    or tells apart another number of classes than are named.
     """
-    path = Path(path)
+    path = SHIPPED if path is None else Path(path)
     if not path.is_file():
-        raise UserError(f"no detector {str(path)!r}: give a .pt or .onnx file")
+        raise UserError(f"no detector {str(path)!r}: give a .pt, .onnx or .npz file")
     # Each takes its second to import, and only one is needed.
     match _kind(path):
         case ".pt":
@@ -47,8 +52,14 @@ def load(
             from arm5dof.vision.onnx import OnnxYOLO
 
             return OnnxYOLO(path, class_names, confidence, iou, size)
+        case ".npz":
+            from arm5dof.vision.detector import TabletopDetector
+
+            if class_names is not None or size is not None:
+                raise UserError(f"{path}: the tabletop detector's class names and its size are fixed: leave them out")
+            return TabletopDetector(path, confidence, iou)
         case _:
-            raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt) or a network as ONNX (.onnx)")
+            raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt), a network as ONNX (.onnx), or .npz")
 
 
 def read_names(path: Path) -> list[str]:
@@ -80,7 +91,7 @@ def detect(
 def _kind(path: Path) -> str | None:
     """The suffix that a file has or, if it has another, should have."""
     suffix = path.suffix.lower()
-    if suffix in (".pt", ".onnx"):
+    if suffix in (".pt", ".onnx", ".npz"):
         return suffix
     if zipfile.is_zipfile(path):
         return ".pt"

@@ -21,13 +21,17 @@ if TYPE_CHECKING:
 HELP = """\
 Find objects of named classes in images.
 
-SOURCE is a photograph, several, folders of them, a video, or a camera by its number: 0 is the first. MODEL is a file
-with a network of the YOLO family:
+SOURCE is a photograph, several, folders of them, a video, or a camera by its number: 0 is the first; or simulated, for
+random scenes such as the shipped detector was trained for, simulated:20 for 20 of them.
+
+The shipped detector finds the things of our catalogue on a table. MODEL is a file with another:
 
   .pt     YOLOv5's own weights (n, s, m, l, x, release 6 and later), or what was trained from them with that code; run
           in JAX. The file is read without PyTorch, and nothing that it says is run.
   .onnx   YOLOv5, v7, v8, v11 or YOLOX exported as ONNX, without suppression; run by OpenCV.
+  .npz    weights of our detector, as arm5dof vision train writes them.
 
+  arm5dof vision detect simulated --out found
   arm5dof vision detect bus.jpg --detector yolov5n.pt
   arm5dof vision detect photos/ --detector best.onnx --names classes.txt --out found
   arm5dof vision detect clip.mp4 --detector yolov5n.pt --classes person,bus --out found
@@ -48,8 +52,8 @@ def declare(commands: argparse._SubParsersAction) -> None:
     """Add `detect` to the vision commands."""
     raw = argparse.RawDescriptionHelpFormatter
     p = commands.add_parser("detect", help="find objects in images", description=HELP, formatter_class=raw)
-    p.add_argument("source", nargs="+", metavar="SOURCE", help="photographs, folders of them, a video, or a camera")
-    p.add_argument("--detector", type=Path, required=True, metavar="MODEL", help="a .pt or .onnx file")
+    p.add_argument("source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, or simulated")
+    p.add_argument("--detector", type=Path, metavar="MODEL", help="a .pt, .onnx or .npz file; default: what ships")
     p.add_argument("--names", type=Path, metavar="FILE", help="names of the classes, one a line; default: the model's")
     p.add_argument("--classes", type=_list, metavar="A,B,...", help="what to look for; default: every class")
     p.add_argument("--confidence", type=float, default=0.25, metavar="P", help="how sure to be, 0 to 1; default 0.25")

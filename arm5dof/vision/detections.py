@@ -110,7 +110,13 @@ def check_thresholds(confidence: float, iou: float) -> None:
 
 
 def suppress(
-    boxes: np.ndarray, scores: np.ndarray, class_names: tuple[str, ...], confidence: float, iou: float, limit: int = 300
+    boxes: np.ndarray,
+    scores: np.ndarray,
+    class_names: tuple[str, ...],
+    confidence: float,
+    iou: float,
+    limit: int = 300,
+    across: bool = False,
 ) -> Detections:
     """Each box's best class, the boxes at least so confident, and of those of one class that overlap more than `iou`
     the best.
@@ -118,6 +124,7 @@ def suppress(
     boxes:  (n, 4) centre x and y, width, height, pixels
     scores: (n, classes)
     limit:  the largest number of detections
+    across: of those that overlap, the best of all classes
     """
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
         raise UserError("the network's output is not finite: its weights are damaged")
@@ -128,7 +135,8 @@ def suppress(
     corner, far = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
     # OpenCV moves the classes apart by the largest coordinate, which is far enough only if none is negative.
     whole = np.concatenate([corner - corner.min(0, initial=0), boxes[:, 2:]], axis=1)
+    group = np.zeros_like(best) if across else best
     chosen = np.asarray(
-        cv2.dnn.NMSBoxesBatched(whole.tolist(), score.tolist(), best.tolist(), 0.0, iou) if len(kept) else (), int
+        cv2.dnn.NMSBoxesBatched(whole.tolist(), score.tolist(), group.tolist(), 0.0, iou) if len(kept) else (), int
     )[:limit]
     return Detections(np.concatenate([corner, far], axis=1)[chosen], score[chosen], best[chosen], class_names)

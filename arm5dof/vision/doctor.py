@@ -20,8 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from arm5dof.vision import gl
+from arm5dof.vision.detector import TabletopDetector
+from arm5dof.vision.proposals import overlap
 from arm5dof.vision.scenery import CAMERA
 from arm5dof.vision.scenes import random_scene
+from arm5dof.vision.shots import shoot
 from arm5dof.vision.software import SoftwareRenderer
 from arm5dof.vision.yolov5_layers import Conv
 
@@ -72,6 +75,7 @@ def rendering(broken: str | None = None) -> Iterator[Finding]:
 
 def detectors() -> Iterator[Finding]:
     """What can detect, one by one as it is found out."""
+    yield _tabletop()
     yield _yolov5()
     yield _onnx()
 
@@ -95,6 +99,21 @@ def _opengl(library: str) -> Finding:
             return Finding(what, True, f"{ms:.0f} ms; {seen}")
     remedies = [commands[library] for tool, commands in INSTALL.items() if library in commands and shutil.which(tool)]
     return Finding(what, False, wrong, (*remedies, "not needed: software draws the same")[0])
+
+
+def _tabletop() -> Finding:
+    """What ships, on some pictures of what it was trained for."""
+    what, detector = "what ships", TabletopDetector()
+    shots = [shoot(number, 0, "evaluation", "software") for number in range(SCENES)]
+    there = found = 0
+    for shot in shots:
+        seen, counts = detector(shot.picture), shot.truth.counts
+        fit = overlap(shot.truth.xyxy, seen.xyxy) * (shot.truth.class_id[:, None] == seen.class_id)
+        there, found = there + int(counts.sum()), found + int((fit[counts].max(1, initial=0) > 0.5).sum())
+    ms = _milliseconds(lambda: detector(shots[0].picture))
+    detail = f"found {found} of {there} things in {SCENES} simulated pictures, {ms:.1f} ms a picture of 640 x 480"
+    works = 2 * found > there
+    return Finding(what, works, detail, "" if works else "pip install --upgrade jax")
 
 
 def _yolov5() -> Finding:

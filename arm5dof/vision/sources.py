@@ -1,4 +1,5 @@
-"""Where images come from: photographs, folders of them, a video, a camera. One after another, as frames."""
+"""Where images come from: photographs, folders of them, a video, a camera, or random scenes drawn for the purpose. One
+after another, as frames."""
 
 from __future__ import annotations
 
@@ -18,6 +19,9 @@ from arm5dof.vision.opencv import quiet
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """What counts as a photograph in a folder; a file that is named may be called anything."""
+
+SCENES = 10
+"""How many random scenes are drawn unless a number is given."""
 
 USUAL_RATE = 30.0
 """Frames per second where a video or camera does not say."""
@@ -60,12 +64,15 @@ class Source:
 
 
 def open_source(given: Sequence[str]) -> Source:
-    """What a command line names: a camera by its number, a video file, or any number of photographs and folders.
+    """What a command line names: a camera by its number, `simulated` or `simulated:N` for random scenes, a video file,
+    or any number of photographs and folders.
 
     Raises `UserError` if it is none of these, or several that do not go together.
     """
     if len(given) == 1 and re.fullmatch(r"\d{1,3}", given[0]):
         return camera(int(given[0]))
+    if len(given) == 1 and (match := re.fullmatch(r"simulated(?::(\d{1,6}))?", given[0])):
+        return simulated(int(match[1] or SCENES))
     paths = [Path(text) for text in given]
     for path in paths:
         if not path.exists():
@@ -143,6 +150,17 @@ def camera(index: int) -> Source:
         raise UserError(f"camera {index} gives no picture{' any more' if first else ''}: was it unplugged or closed?")
 
     return Source(frames(), None, _rate(capture), live=True)
+
+
+def simulated(count: int) -> Source:
+    """The first random scenes in the style of evaluation, 640 x 480. Raises `UserError` for none."""
+    if count < 1:
+        raise UserError("simulated:0 is no scene: ask for one or more")
+    from arm5dof.vision.shots import shoot  # MuJoCo takes its time to import.
+
+    names = (f"scene{number}.png" for number in range(count))
+    frames = (Frame(name, shoot(number, 0, "evaluation", "auto").picture) for number, name in enumerate(names))
+    return Source(frames, count)
 
 
 def _is_video(path: Path) -> bool:

@@ -1,0 +1,81 @@
+"""The crops that the refiner learns from: round what the proposer proposed in the pictures that it learnt from, and
+round true boxes, moved a little."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from arm5dof.vision.proposals import crop, overlap, squares, to_crop
+from arm5dof.vision.training_set import TrainingSet, relit
+from arm5dof.vision.truth import VISIBLE
+
+THING, BACKGROUND = 0.4, 0.3
+"""A proposal is of a thing that it overlaps by so much; if it overlaps none by as little as this, it is of none."""
+MOVED, SCALED = 0.2, 0.2
+"""How far the middles of boxes are moved, in their width and height, and the logarithm of how much they are scaled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Boxes to look at closely, and what is there."""
+
+    scene: np.ndarray
+    """(n,) in which picture."""
+    boxes: np.ndarray
+    """(n, 4) pixels."""
+    wanted: np.ndarray
+    """(n, 4) the box of the thing that is there; of background, the box itself."""
+    class_id: np.ndarray
+    """(n,), -1 for background."""
+
+
+def candidates(data: TrainingSet, scene: int, proposals: np.ndarray) -> Candidates:
+    """Of one scene: proposals (n, 4), and the boxes of the things. What is mostly hidden is left out."""
+    mine = np.s_[data.first(scene) : data.first(scene + 1)]
+    things, class_id, counts = data.boxes[mine], data.class_id[mine], data.visible[mine] >= VISIBLE
+    if not len(things):
+        return Candidates(np.full(len(proposals), scene), proposals, proposals, np.full(len(proposals), -1))
+    boxes = np.concatenate([proposals, things[counts]])
+    fit = overlap(boxes, things)
+    best, which = fit.max(1), fit.argmax(1)
+    none = best < BACKGROUND
+    wanted = np.where(none[:, None], boxes, things[which])
+    taken = none | ((best >= THING) & counts[which])
+    return Candidates(
+        np.full(taken.sum(), scene), boxes[taken], wanted[taken], np.where(none, -1, class_id[which])[taken]
+    )
+
+
+def batch(
+    data: TrainingSet, found: Candidates, seed: tuple[int, ...], size: int
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Crops (size, CROP, CROP, 3) uint8 and how wide they were, (size,), pixels; the boxes (size, 4) of what they show,
+    as shares of the crop, and its class (size,), -1 for background. The same seed gives the same bits."""
+    rng = np.random.default_rng(seed)
+    things, background = np.flatnonzero(found.class_id >= 0), np.flatnonzero(found.class_id < 0)
+    half = size // 2 if len(background) else size
+    rows = np.concatenate([rng.choice(rows, k) for rows, k in ((things, half), (background, size - half)) if k])
+    crops, widths, wanted = zip(*(_crop(data, found, row, rng) for row in rows), strict=True)
+    boxes = np.stack(wanted).astype(np.float32)
+    return (np.stack(crops), np.array(widths, np.float32)), (boxes, found.class_id[rows].astype(np.int32))
+
+
+def _crop(
+    data: TrainingSet, found: Candidates, row: int, rng: np.random.Generator
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """One, moved, turned, mirrored and in other light."""
+    low, high = np.split(found.boxes[row].astype(float), 2)
+    middle = (low + high) / 2 + rng.uniform(-MOVED, MOVED, 2) * (high - low)
+    half = (high - low) / 2 * np.exp(rng.uniform(-SCALED, SCALED, 2))
+    (square,) = squares(np.concatenate([middle - half, middle + half])[None])
+    seen = crop(data.pictures[found.scene[row]], square)
+    (wanted,) = to_crop(found.wanted[row][None], square[None])
+    for axis in (0, 1):
+        if rng.random() < 0.5:
+            seen = np.flip(seen, 1 - axis)
+            wanted[[axis, axis + 2]] = 1 - wanted[[axis + 2, axis]]
+    if rng.random() < 0.5:
+        seen, wanted = seen.transpose(1, 0, 2), wanted[[1, 0, 3, 2]]
+    return relit(np.ascontiguousarray(seen), rng), float(square[2]), np.clip(wanted, -0.5, 1.5)

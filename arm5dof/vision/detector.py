@@ -1,0 +1,173 @@
+"""`TabletopDetector`: the detector that ships, for the things of the catalogue on a table.
+
+    found = TabletopDetector()(image)
+
+Its weights are a `.npz` file, trained by `arm5dof vision train`: arrays by their names in the network, normalisation
+folded in, and the names of the classes. Nothing in it is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from arm5dof import files, xla
+from arm5dof.errors import UserError
+from arm5dof.vision.detect import SHIPPED
+from arm5dof.vision.detections import Detections, check_thresholds, suppress
+from arm5dof.vision.images import letterbox, rgb
+from arm5dof.vision.network import COARSEST, CROP, Proposer, Refiner
+from arm5dof.vision.proposals import REDUCED, crop, overlap, squares, to_picture
+
+SIZE = (640, 480)
+"""Width and height of the pictures that it looks at, pixels. Other images are fitted in."""
+PROPOSALS = 24
+"""The most that are looked at closely."""
+LIKELY = 0.06
+"""Proposals less so are not."""
+TRUST = 0.4
+"""A detection's confidence is the geometric mean of what both networks say, with this weight for the proposer's."""
+APART = 0.6
+"""Of proposals that overlap more the likeliest is looked at."""
+NAMES = "class_names"
+DAMAGED = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    AttributeError,
+)
+"""What NumPy raises for files that are no archives of arrays."""
+
+
+class TabletopDetector:
+    """Finds things of the catalogue in images.
+
+    weights:     a file that `arm5dof vision train` wrote; without it, the one that ships
+    confidence:  detections below are dropped
+    iou:         of boxes that overlap more the best stays, whatever their classes: a thing is of one class
+
+    Raises `UserError` if the file is missing, damaged or of another network.
+    """
+
+    def __init__(self, weights: str | Path | None = None, confidence: float = 0.25, iou: float = 0.6) -> None:
+        check_thresholds(confidence, iou)
+        params, self._class_names = load_weights(SHIPPED if weights is None else weights)
+        self._params = jax.device_put(params)
+        self._confidence, self._iou = confidence, iou
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        return self._class_names
+
+    def __call__(self, image: np.ndarray) -> Detections:
+        """Detections in an RGB uint8 image (h, w, 3)."""
+        boxed = letterbox(rgb(image), SIZE)
+        proposed, likely = propose(self._params["proposer"], boxed.image)
+        boxes, scores = refine(self._params["refiner"], boxed.image, proposed)
+        scores = scores ** (1 - TRUST) * likely[:, None] ** TRUST
+        found = suppress(boxes, scores, self._class_names, self._confidence, self._iou, across=True)
+        return replace(found, xyxy=boxed.to_source(found.xyxy))
+
+
+def propose(params: dict[str, Any], picture: np.ndarray, least: float = LIKELY) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (n, 4) of what may be things in a picture, pixels, and how likely they are (n,), the likeliest first and
+    none less than `least`."""
+    reduced = cv2.resize(picture, REDUCED, interpolation=cv2.INTER_AREA)
+    boxes, logits = (np.asarray(x) for x in _proposer()(params, reduced))
+    candidates = np.flatnonzero(logits > np.log(least / (1 - least)))
+    candidates = candidates[np.argsort(-logits[candidates], kind="stable")][: 4 * PROPOSALS]
+    boxes = boxes[candidates] * (picture.shape[1] / REDUCED[0])
+    fit = overlap(boxes, boxes)
+    kept: list[int] = []
+    for i in range(len(boxes)):
+        if len(kept) < PROPOSALS and not (fit[i, kept] > APART).any():
+            kept.append(i)
+    return boxes[kept], 1 / (1 + np.exp(-logits[candidates[kept]]))
+
+
+def refine(params: dict[str, Any], picture: np.ndarray, proposed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (n, 4), centre and size in pixels, and scores (n, classes) of what lies in the proposed boxes (n, 4)."""
+    classes = params["logits"]["bias"].size
+    if not len(proposed):
+        return np.empty((0, 4)), np.empty((0, classes))
+    where = squares(proposed)
+    rows = np.minimum(np.arange(-(-len(where) // 4) * 4), len(where) - 1)  # Compiled for 4, 8, 12, ... crops.
+    crops, widths = np.stack([crop(picture, where[i]) for i in rows]), where[rows, 2].astype(np.float32)
+    shares, logits = (np.asarray(x) for x in _refiner()(params, crops, widths))
+    boxes = to_picture(shares[: len(where)], where)
+    low, high = boxes[:, :2], boxes[:, 2:]
+    return np.concatenate([(low + high) / 2, high - low], axis=1), 1 / (1 + np.exp(-logits[: len(where)]))
+
+
+@cache
+def _proposer() -> Any:
+    """Weights and a reduced picture to boxes (n, 4) and logits (n,)."""
+
+    def forward(params: dict[str, Any], picture: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found: Any = Proposer(normalised=False).apply({"params": params}, picture[None])
+        (boxes,), (logits,) = found
+        return boxes, logits
+
+    return jax.jit(forward, compiler_options=xla.fusion_emitters())
+
+
+@cache
+def _refiner() -> Any:
+    """Weights, crops (n, CROP, CROP, 3) and their widths (n,) to boxes (n, 4) and logits (n, classes)."""
+
+    def forward(params: dict[str, Any], crops: jax.Array, widths: jax.Array) -> Any:
+        return Refiner(params["logits"]["bias"].size, normalised=False).apply({"params": params}, crops, widths)
+
+    return jax.jit(forward, compiler_options=xla.fusion_emitters())
+
+
+def save_weights(path: Path, params: dict[str, Any], class_names: Sequence[str]) -> None:
+    """Write folded weights atomically, rounded to half precision. The same weights give the same bits."""
+    arrays = {name: np.asarray(value, np.float16) for name, value in flatten_dict(params, sep="/").items()}
+    with files.replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{NAMES: np.array(class_names)}, **arrays)
+
+
+def load_weights(path: str | Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Folded weights in single precision, and the names of the classes. Raises `UserError`."""
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"no weights {str(path)!r}: give a file that arm5dof vision train wrote")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        class_names = tuple(str(name) for name in arrays.pop(NAMES))
+        arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
+    except DAMAGED:
+        raise UserError(
+            f"{path} is damaged, or no weights of this detector: train them with arm5dof vision train"
+        ) from None
+    shapes = {name: value.shape for name, value in arrays.items()}
+    if shapes != _shapes(len(class_names)) or not all(np.isfinite(value).all() for value in arrays.values()):
+        raise UserError(f"{path} holds other weights than the network has: train them anew with arm5dof vision train")
+    return unflatten_dict(arrays, sep="/"), class_names
+
+
+@cache
+def _shapes(classes: int) -> dict[str, tuple[int, ...]]:
+    picture, crops = (np.zeros((1, side, side, 3), np.uint8) for side in (COARSEST, CROP))
+    made = {
+        "proposer": jax.eval_shape(Proposer(normalised=False).init, jax.random.key(0), picture),
+        "refiner": jax.eval_shape(Refiner(classes, False).init, jax.random.key(0), crops, np.ones(1, np.float32)),
+    }
+    params = {name: variables["params"] for name, variables in made.items()}
+    return {name: value.shape for name, value in flatten_dict(params, sep="/").items()}
