@@ -442,6 +442,9 @@ def test_the_same_seed_trains_the_same_bits(small, learner):
         (["train", "--scenes", "0", "--out", "nowhere"], "scenes is 1 or more"),
         (["train", "--seed", "-1", "--out", "nowhere"], "seed is 0 or more"),
         (["train", "--epochs", "3"], "--epochs"),
+        (["eval", "--scenes", "0"], "scenes is 1 or more"),
+        (["eval", "--seed", "-1"], "seed is 0 or more"),
+        (["eval", "--weights", "nowhere.npz"], "nowhere.npz"),
     ],
 )
 def test_bad_command_lines(arguments, says, capsys, tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from arm5dof import files
 from arm5dof.vision import (
     detect_command,
     doctor_command,
+    eval_command,
     hand_eye_command,
     locate_command,
     options,
@@ -71,6 +72,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     detect_command.declare(commands)
     locate_command.declare(commands)
     train_command.declare(commands)
+    eval_command.declare(commands)
     doctor_command.declare(commands)
 
 
