@@ -9,6 +9,7 @@ from arm5dof.vision import uncertainty
 from arm5dof.vision.boards import Checkerboard, Corners
 from arm5dof.vision.calibrate import View, board_pose, fit
 from arm5dof.vision.camera import Camera
+from arm5dof.vision.extrinsics import from_corners
 from arm5dof.vision.solid import Solid
 
 WIDTH, HEIGHT = 640, 480
@@ -64,9 +65,7 @@ def calibrated_and_posed(rng):
     """A camera over the table, and what one knows of it: calibrated from 13 views, posed from a board on the table."""
     true, camera = over_the_table(rng), calibrated(rng)
     seen = corners(rng, np.linalg.inv(true) @ BOARD_TO_BASE)
-    noise = uncertainty.board_noise(camera, seen, board_pose(camera, seen))
-    found = uncertainty.with_pose(camera, lambda c: BOARD_TO_BASE @ np.linalg.inv(board_pose(c, seen)), noise)
-    return camera_at(true), found
+    return camera_at(true), from_corners(camera, seen, BOARD_TO_BASE)
 
 
 ROUND = np.linspace(0, 2 * np.pi, 40, endpoint=False)

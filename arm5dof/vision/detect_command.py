@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arm5dof.errors import UserError
+from arm5dof.vision import options
 
 if TYPE_CHECKING:
     from arm5dof.vision.outputs import Write
@@ -70,8 +71,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(known: argparse.Namespace, rest: list[str]) -> int:
     """`arm5dof vision detect`."""
-    if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof vision detect --help)")
+    options.nothing_left(rest, "detect")
     if known.out is not None and known.out.exists():
         raise UserError(f"{known.out} exists: choose another --out")
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from arm5dof.vision import gl
 from arm5dof.vision.detector import TabletopDetector
-from arm5dof.vision.proposals import overlap
+from arm5dof.vision.positions import pairs
 from arm5dof.vision.scenery import CAMERA
 from arm5dof.vision.scenes import random_scene
 from arm5dof.vision.shots import shoot
@@ -107,9 +107,8 @@ def _tabletop() -> Finding:
     shots = [shoot(number, 0, "evaluation", "software") for number in range(SCENES)]
     there = found = 0
     for shot in shots:
-        seen, counts = detector(shot.picture), shot.truth.counts
-        fit = overlap(shot.truth.xyxy, seen.xyxy) * (shot.truth.class_id[:, None] == seen.class_id)
-        there, found = there + int(counts.sum()), found + int((fit[counts].max(1, initial=0) > 0.5).sum())
+        there += int(shot.truth.counts.sum())
+        found += len(pairs(detector(shot.picture), shot.truth)[0])
     ms = _milliseconds(lambda: detector(shots[0].picture))
     detail = f"found {found} of {there} things in {SCENES} simulated pictures, {ms:.1f} ms a picture of 640 x 480"
     works = 2 * found > there

@@ -10,7 +10,7 @@ import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from arm5dof.errors import UserError
+from arm5dof.vision import options
 
 if TYPE_CHECKING:
     from arm5dof.vision.doctor import Finding
@@ -33,8 +33,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(known: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision doctor`."""
-    if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof vision doctor --help)")
+    options.nothing_left(rest, "doctor")
     broken = _broken_choice()
 
     from arm5dof.vision import doctor

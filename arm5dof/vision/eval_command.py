@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arm5dof.errors import UserError
+from arm5dof.vision import options
 
 if TYPE_CHECKING:
     from arm5dof.vision.evaluate import Result
@@ -41,8 +42,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(known: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision eval`."""
-    if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof vision eval --help)")
+    options.nothing_left(rest, "eval")
     for name, least in (("scenes", 1), ("seed", 0)):
         if getattr(known, name) < least:
             raise UserError(f"--{name} is {least} or more, not {getattr(known, name)}")

@@ -30,6 +30,13 @@ def from_board(
     if corners is None:
         mismatch = board.mismatch([board.inspect(read_grey(path), None)])
         raise UserError(f"{path} does not show the {board}; {mismatch or 'is it seen whole, in focus?'}")
+    return from_corners(camera, corners, board_to_base, placed)
+
+
+def from_corners(
+    camera: Camera, corners: Corners, board_to_base: np.ndarray, placed: tuple[float, float] = (0.0, 0.0)
+) -> Camera:
+    """The same from corners that have been found."""
     seen = board_pose(camera, corners)
     noise = uncertainty.board_noise(camera, corners, seen) + uncertainty.carried(placed, seen)
     return uncertainty.with_pose(camera, lambda c: board_to_base @ np.linalg.inv(board_pose(c, corners)), noise)

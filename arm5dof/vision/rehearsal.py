@@ -13,6 +13,7 @@ from arm5dof.vision import uncertainty
 from arm5dof.vision.boards import Checkerboard, Corners
 from arm5dof.vision.calibrate import View, board_pose, fit
 from arm5dof.vision.camera import Camera
+from arm5dof.vision.extrinsics import from_corners
 
 VIEWS = 13
 BOARD = Checkerboard(9, 6, 0.025)
@@ -35,9 +36,7 @@ def rehearse(camera: Camera, rng: np.random.Generator) -> Camera:
     turn, shift = PLACED[1] * rng.normal(size=3), PLACED[0] * rng.normal(size=3)
     true = lying @ _pose(cv2.Rodrigues(turn)[0], shift)
     seen = _corners(camera, np.linalg.inv(_pose(np.asarray(camera.rotation), np.asarray(camera.position))) @ true, rng)
-    board = board_pose(known, seen)
-    noise = uncertainty.board_noise(known, seen, board) + uncertainty.carried(PLACED, board)
-    return uncertainty.with_pose(known, lambda c: lying @ np.linalg.inv(board_pose(c, seen)), noise)
+    return from_corners(known, seen, lying, PLACED)
 
 
 def calibrated(camera: Camera, rng: np.random.Generator) -> Camera:

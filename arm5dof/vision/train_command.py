@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from arm5dof.errors import UserError
+from arm5dof.vision import options
 
 HELP = """\
 Train the detector of tabletop things that ships with arm5dof, from nothing: random scenes are drawn in software, with
@@ -35,8 +36,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(known: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision train`."""
-    if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof vision train --help)")
+    options.nothing_left(rest, "train")
     if known.out.exists():
         raise UserError(f"{known.out} exists: choose another --out")
 
