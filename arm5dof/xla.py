@@ -50,6 +50,11 @@ def fusion_emitters() -> dict[str, bool]:
     return {"xla_cpu_use_fusion_emitters": True} if known else {}
 
 
+def cores() -> int:
+    """How many CPU cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def enable_compilation_cache() -> None:
     """Keep compiled programs on disk between runs, unless the user has said where or that they want none."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm5dof.errors import UserError
-from arm5dof.vision.detections import Detections, check_thresholds, suppress
+from arm5dof.vision.detections import Detections, check_thresholds, strongest, suppress
 
 NAMES = ("cube", "ball", "ring")
 
@@ -89,11 +89,12 @@ def test_suppression_keeps_the_best_of_each_class(seed, n, threshold):
     np.testing.assert_array_equal(again.xyxy, found.xyxy)
 
 
-def test_suppression_across_classes_keeps_the_best_of_all():
+def test_suppression_keeps_classes_apart_and_without_them_the_best_of_all():
     boxes, scores = np.array([[5, 5, 4, 4], [5, 5, 4, 5], [50, 5, 4, 4]]), np.array([[0.6, 0], [0, 0.9], [0.7, 0]])
-    assert len(suppress(boxes, scores, ("cube", "ball"), 0.25, 0.45)) == 3
-    found = suppress(boxes, scores, ("cube", "ball"), 0.25, 0.45, across=True)
-    np.testing.assert_array_equal(found.class_id, [1, 0])
+    found = suppress(boxes, scores, ("cube", "ball"), 0.25, 0.45)
+    assert len(found) == 3
+    kept = strongest(found.xyxy, found.confidence, 0.45)
+    np.testing.assert_array_equal(found.class_id[kept], [1, 0])
 
 
 def test_suppression_of_nothing_of_flat_boxes_and_of_too_many():

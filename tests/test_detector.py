@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from arm5dof.cli import main
@@ -17,7 +17,7 @@ from arm5dof.vision import assignment, crops, training_set
 from arm5dof.vision.assignment import CELLS, Labels, assign, generalised_overlap, overlap, proposed, refined
 from arm5dof.vision.catalogue import CLASS_NAMES
 from arm5dof.vision.detect import load
-from arm5dof.vision.detector import PROPOSALS, TRUST, TabletopDetector, load_weights, propose, save_weights
+from arm5dof.vision.detector import PROPOSALS, TRUST, TabletopDetector, load_weights, propose, refine, save_weights
 from arm5dof.vision.network import CROP, INNER, REACH, STRIDE, Proposer, Refiner, cells, enlarge, fold, patches
 from arm5dof.vision.proposals import CONTEXT, crop, squares, to_crop, to_picture
 from arm5dof.vision.train_detector import Learner
@@ -239,7 +239,7 @@ def test_detections_are_in_the_image_s_own_pixels(tmp_path, width, height, scale
     expected = (1 + np.exp(-3)) ** -TRUST * (1 + np.exp(-2)) ** (TRUST - 1)
     np.testing.assert_allclose(found.confidence, expected, rtol=1e-3)
     assert (found.xyxy >= 0).all() and (found.xyxy <= [width, height, width, height]).all()
-    whole = found.xyxy[(found.xyxy[:, 0] > 0)] / scale
+    whole = found.xyxy[(found.xyxy[:, 0] > 0) & (found.xyxy[:, 2] < width)] / scale
     assert len(whole) > 5
     np.testing.assert_allclose(whole[:, 2:] - whole[:, :2], 12, atol=0.1)
     middles = whole[:, :2] + 6 + [left, 0]
@@ -255,6 +255,22 @@ def test_overlapping_boxes_are_one_thing(wide):
     assert 10 < len(boxes) <= len(proposals) <= PROPOSALS and fit.max() < 0.601
     assert len(TabletopDetector(wide, confidence=0.95)(GREY)) == 0
     assert len(TabletopDetector(wide, iou=0.1)(GREY)) < len(boxes)
+
+
+@settings(max_examples=5, deadline=None)
+@given(SEEDS)
+def test_a_mirrored_look_is_a_look_in_the_mirror(seed):
+    random = np.random.default_rng(seed)
+    params = jax.tree.map(lambda x: random.normal(0, 0.1, x.shape), zeros("refiner"))
+    picture = random.integers(0, 256, (480, 640, 3)).astype(np.uint8)
+    low = random.uniform(20, 400, (5, 2))
+    boxes = np.concatenate([low, low + random.uniform(10, 60, (5, 2))], axis=1)
+    there, logits = refine(params, picture, boxes, mirrored=True)
+    mirror = lambda boxes: np.array([640, 0, 640, 0]) + boxes[:, [2, 1, 0, 3]] * [-1, 1, -1, 1]
+    mirrored, same = refine(params, np.ascontiguousarray(picture[:, ::-1]), mirror(boxes))
+    # OpenCV places pixels to a thirty-second.
+    np.testing.assert_allclose(there, mirror(mirrored), atol=0.2)
+    np.testing.assert_allclose(logits, same, atol=0.05)
 
 
 def test_a_picture_without_proposals_has_no_detections(tmp_path):

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from arm5dof.vision.proposals import crop, overlap, squares, to_crop
-from arm5dof.vision.training_set import TrainingSet, relit
+from arm5dof.vision.training_set import TrainingSet, overprinted, relit
 from arm5dof.vision.truth import VISIBLE
 
 THING, BACKGROUND = 0.4, 0.3
@@ -70,7 +71,9 @@ def _crop(
     middle = (low + high) / 2 + rng.uniform(-MOVED, MOVED, 2) * (high - low)
     half = (high - low) / 2 * np.exp(rng.uniform(-SCALED, SCALED, 2))
     (square,) = squares(np.concatenate([middle - half, middle + half])[None])
-    seen = crop(data.pictures[found.scene[row]], square)
+    scene = found.scene[row]
+    owner = crop(data.owners[scene], square, cv2.INTER_NEAREST)
+    seen = overprinted(crop(data.pictures[scene], square), owner, rng)
     (wanted,) = to_crop(found.wanted[row][None], square[None])
     for axis in (0, 1):
         if rng.random() < 0.5:

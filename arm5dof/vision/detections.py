@@ -109,6 +109,18 @@ def check_thresholds(confidence: float, iou: float) -> None:
             raise UserError(f"{name} must lie between 0 and 1, got {value}")
 
 
+def strongest(xyxy: np.ndarray, scores: np.ndarray, iou: float, group: np.ndarray | None = None) -> np.ndarray:
+    """Which of boxes (n, 4), left, top, right and bottom edges, are left, the highest score (n,) first, when of those
+    of one group (n,) that overlap more than `iou` only the best stays. Without groups all are of one."""
+    if not len(xyxy):
+        return np.empty(0, int)
+    # OpenCV moves groups apart by the largest coordinate, which is far enough only if none is negative.
+    corner = xyxy[:, :2] - xyxy[:, :2].min(0, initial=0)
+    whole = np.concatenate([corner, xyxy[:, 2:] - xyxy[:, :2]], axis=1)
+    group = np.zeros(len(xyxy), int) if group is None else group
+    return np.asarray(cv2.dnn.NMSBoxesBatched(whole.tolist(), scores.tolist(), group.tolist(), 0.0, iou), int)
+
+
 def suppress(
     boxes: np.ndarray,
     scores: np.ndarray,
@@ -116,7 +128,6 @@ def suppress(
     confidence: float,
     iou: float,
     limit: int = 300,
-    across: bool = False,
 ) -> Detections:
     """Each box's best class, the boxes at least so confident, and of those of one class that overlap more than `iou`
     the best.
@@ -124,7 +135,6 @@ def suppress(
     boxes:  (n, 4) centre x and y, width, height, pixels
     scores: (n, classes)
     limit:  the largest number of detections
-    across: of those that overlap, the best of all classes
     """
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
         raise UserError("the network's output is not finite: its weights are damaged")
@@ -132,11 +142,6 @@ def suppress(
     score = scores[np.arange(len(scores)), best]
     kept = np.flatnonzero((score >= confidence) & (boxes[:, 2:] > 0).all(1))
     boxes, score, best = boxes[kept], score[kept], best[kept]
-    corner, far = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
-    # OpenCV moves the classes apart by the largest coordinate, which is far enough only if none is negative.
-    whole = np.concatenate([corner - corner.min(0, initial=0), boxes[:, 2:]], axis=1)
-    group = np.zeros_like(best) if across else best
-    chosen = np.asarray(
-        cv2.dnn.NMSBoxesBatched(whole.tolist(), score.tolist(), group.tolist(), 0.0, iou) if len(kept) else (), int
-    )[:limit]
-    return Detections(np.concatenate([corner, far], axis=1)[chosen], score[chosen], best[chosen], class_names)
+    xyxy = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
+    chosen = strongest(xyxy, score, iou, best)[:limit]
+    return Detections(xyxy[chosen], score[chosen], best[chosen], class_names)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,21 +24,25 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from arm5dof import files, xla
 from arm5dof.errors import UserError
 from arm5dof.vision.detect import SHIPPED
-from arm5dof.vision.detections import Detections, check_thresholds, suppress
+from arm5dof.vision.detections import Detections, check_thresholds, strongest
 from arm5dof.vision.images import letterbox, rgb
 from arm5dof.vision.network import COARSEST, CROP, Proposer, Refiner
-from arm5dof.vision.proposals import REDUCED, crop, overlap, squares, to_picture
+from arm5dof.vision.proposals import REDUCED, crop, squares, to_picture
 
 SIZE = (640, 480)
 """Width and height of the pictures that it looks at, pixels. Other images are fitted in."""
-PROPOSALS = 24
+PROPOSALS = 32
 """The most that are looked at closely."""
-LIKELY = 0.06
+LIKELY = 0.02
 """Proposals less so are not."""
-TRUST = 0.4
-"""A detection's confidence is the geometric mean of what both networks say, with this weight for the proposer's."""
 APART = 0.6
 """Of proposals that overlap more the likeliest is looked at."""
+TRUST = 0.4
+"""A detection's confidence is the geometric mean of what both networks say, with this weight for the proposer's."""
+AGAIN = 0.05
+"""What is at least so confident is looked at again, mirrored, from where it then seems to be. Nothing else is found."""
+TOGETHER = 4
+"""So many crops are one call of the refiner."""
 NAMES = "class_names"
 DAMAGED = (
     zipfile.BadZipFile,
@@ -77,10 +81,25 @@ class TabletopDetector:
         """Detections in an RGB uint8 image (h, w, 3)."""
         boxed = letterbox(rgb(image), SIZE)
         proposed, likely = propose(self._params["proposer"], boxed.image)
-        boxes, scores = refine(self._params["refiner"], boxed.image, proposed)
-        scores = scores ** (1 - TRUST) * likely[:, None] ** TRUST
-        found = suppress(boxes, scores, self._class_names, self._confidence, self._iou, across=True)
-        return replace(found, xyxy=boxed.to_source(found.xyxy))
+        boxes, logits = refine(self._params["refiner"], boxed.image, proposed)
+        again = self._best(boxes, logits, likely, AGAIN)
+        closer, surer = refine(self._params["refiner"], boxed.image, boxes[again], mirrored=True)
+        boxes, logits, likely = (boxes[again] + closer) / 2, (logits[again] + surer) / 2, likely[again]
+        found = self._best(boxes, logits, likely, self._confidence)
+        scores = confidences(logits[found], likely[found])
+        return Detections(boxed.to_source(boxes[found]), scores.max(1), scores.argmax(1), self._class_names)
+
+    def _best(self, boxes: np.ndarray, logits: np.ndarray, likely: np.ndarray, least: float) -> np.ndarray:
+        """Which of the boxes (n, 4) are things, at least so confidently: the best wherever several overlap."""
+        scores = confidences(logits, likely).max(1)
+        rows = np.flatnonzero((scores >= least) & (boxes[:, 2:] > boxes[:, :2]).all(1))
+        return rows[strongest(boxes[rows], scores[rows], self._iou)]
+
+
+def confidences(logits: np.ndarray, likely: np.ndarray) -> np.ndarray:
+    """Of each class (n, classes), from the refiner's logits (n, classes) and how likely the proposer thought that there
+    is something (n,)."""
+    return np.asarray((1 + np.exp(-logits)) ** (TRUST - 1) * likely[:, None] ** TRUST)
 
 
 def propose(params: dict[str, Any], picture: np.ndarray, least: float = LIKELY) -> tuple[np.ndarray, np.ndarray]:
@@ -88,29 +107,37 @@ def propose(params: dict[str, Any], picture: np.ndarray, least: float = LIKELY) 
     none less than `least`."""
     reduced = cv2.resize(picture, REDUCED, interpolation=cv2.INTER_AREA)
     boxes, logits = (np.asarray(x) for x in _proposer()(params, reduced))
-    candidates = np.flatnonzero(logits > np.log(least / (1 - least)))
-    candidates = candidates[np.argsort(-logits[candidates], kind="stable")][: 4 * PROPOSALS]
-    boxes = boxes[candidates] * (picture.shape[1] / REDUCED[0])
-    fit = overlap(boxes, boxes)
-    kept: list[int] = []
-    for i in range(len(boxes)):
-        if len(kept) < PROPOSALS and not (fit[i, kept] > APART).any():
-            kept.append(i)
-    return boxes[kept], 1 / (1 + np.exp(-logits[candidates[kept]]))
+    rows = np.flatnonzero(logits > np.log(least / (1 - least)))
+    boxes, likely = boxes[rows] * (picture.shape[1] / REDUCED[0]), 1 / (1 + np.exp(-logits[rows]))
+    kept = strongest(boxes, likely, APART)[:PROPOSALS]
+    return boxes[kept], likely[kept]
 
 
-def refine(params: dict[str, Any], picture: np.ndarray, proposed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (n, 4), centre and size in pixels, and scores (n, classes) of what lies in the proposed boxes (n, 4)."""
-    classes = params["logits"]["bias"].size
-    if not len(proposed):
+def refine(
+    params: dict[str, Any], picture: np.ndarray, proposed: np.ndarray, mirrored: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (n, 4), pixels, and logits (n, classes) of what lies in the proposed boxes (n, 4)."""
+    count, classes = len(proposed), params["logits"]["bias"].size
+    if not count:
         return np.empty((0, 4)), np.empty((0, classes))
     where = squares(proposed)
-    rows = np.minimum(np.arange(-(-len(where) // 4) * 4), len(where) - 1)  # Compiled for 4, 8, 12, ... crops.
-    crops, widths = np.stack([crop(picture, where[i]) for i in rows]), where[rows, 2].astype(np.float32)
-    shares, logits = (np.asarray(x) for x in _refiner()(params, crops, widths))
-    boxes = to_picture(shares[: len(where)], where)
-    low, high = boxes[:, :2], boxes[:, 2:]
-    return np.concatenate([(low + high) / 2, high - low], axis=1), 1 / (1 + np.exp(-logits[: len(where)]))
+
+    def look(rows: np.ndarray) -> list[np.ndarray]:
+        crops = np.stack([crop(picture, where[i]) for i in rows])
+        crops = np.ascontiguousarray(crops[:, :, ::-1]) if mirrored else crops
+        return [np.asarray(x) for x in _refiner()(params, crops, where[rows, 2].astype(np.float32))]
+
+    rows = np.minimum(np.arange(-(-count // TOGETHER) * TOGETHER), count - 1).reshape(-1, TOGETHER)
+    shares, logits = (np.concatenate(parts)[:count] for parts in zip(*_threads().map(look, rows), strict=True))
+    if mirrored:
+        shares = shares[:, [2, 1, 0, 3]] * [-1, 1, -1, 1] + [1, 0, 1, 0]
+    return to_picture(shares, where), logits
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """XLA keeps but one core busy with networks so small."""
+    return ThreadPoolExecutor(xla.cores(), "detector")
 
 
 @cache

@@ -109,6 +109,8 @@ def letterbox(image: np.ndarray, size: tuple[int, int], stride: int | None = Non
     inner = (max(1, round(width * scale)), max(1, round(height * scale)))
     full = size if stride is None else (-(-inner[0] // stride) * stride, -(-inner[1] // stride) * stride)
     left, top = (full[0] - inner[0]) // 2, (full[1] - inner[1]) // 2
+    if full == (width, height):
+        return Letterbox(image, full, full, (0, 0))
     canvas = np.full((full[1], full[0], 3), GREY, np.uint8)
     resized = image if inner == (width, height) else cv2.resize(image, inner, interpolation=cv2.INTER_LINEAR)
     canvas[top : top + inner[1], left : left + inner[0]] = resized

@@ -46,6 +46,39 @@ def plain(rng: np.random.Generator, size: int) -> np.ndarray:
     return _between(rng, np.zeros((size, size)), contrast=0.0)
 
 
+def stripes(rng: np.random.Generator, size: int) -> np.ndarray:
+    i, j = np.mgrid[:size, :size] / size
+    along = rng.integers(-8, 9) * i + rng.integers(1, 9) * j + rng.uniform(0, 0.5) * _noise(rng, size)
+    share = 0.5 + 0.5 * np.sin(2 * np.pi * along)
+    return _between(rng, share > rng.random() if rng.random() < 0.5 else share, contrast=rng.uniform(0.1, 1))
+
+
+def dots(rng: np.random.Generator, size: int) -> np.ndarray:
+    n, radius = int(rng.choice([3, 4, 6, 10, 16])), rng.uniform(0.15, 0.48)
+    i, j = np.mgrid[:size, :size] * n / size
+    return _between(rng, np.hypot((i + 0.5 * (np.floor(j) % 2)) % 1 - 0.5, j % 1 - 0.5) < radius, rng.uniform(0.1, 1))
+
+
+def splinters(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Cells round random points, each of its own tone."""
+    points = rng.random((int(rng.integers(6, 60)), 2)) * size
+    i, j = np.mgrid[: size // 2, : size // 2] * 2 + 1
+    apart = np.abs(np.stack([i, j], -1)[:, :, None] - points)
+    nearest = (np.minimum(apart, size - apart) ** 2).sum(-1).argmin(-1)
+    tone = rng.random(len(points))[nearest].astype(np.float32)
+    tone = cv2.resize(tone, (size, size), interpolation=cv2.INTER_NEAREST)
+    return _between(rng, tone, contrast=rng.uniform(0.1, 1))
+
+
+def strokes(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Bent lines, one over the other."""
+    share = np.full((size, size), rng.random(), np.float32)
+    for _ in range(rng.integers(5, 60)):
+        line = (rng.uniform(0, size, 2) + rng.normal(0, size / 8, (4, 2)).cumsum(0)).astype(np.int32)
+        cv2.polylines(share, [line], False, rng.random(), int(rng.integers(1, 8)), cv2.LINE_AA)
+    return _between(rng, share, contrast=rng.uniform(0.1, 1))
+
+
 def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
     n, joint = int(rng.choice([2, 3, 5, 8])), int(rng.integers(1, 5))
     i, j = np.mgrid[:size, :size]
@@ -88,6 +121,26 @@ def text(rng: np.random.Generator, size: int) -> np.ndarray:
     return _mix(page, ink, paper)
 
 
+def shapes(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Printed paper: shapes of many colours, full or in outline, on white."""
+    page = np.full((size, size, 3), 255 * rng.uniform(0.8, 1))
+    for _ in range(rng.integers(1, 12)):
+        ink, middle = (255 * colour(rng)).tolist(), rng.uniform(0, size, 2)
+        width = -1 if rng.random() < 0.5 else int(rng.integers(1, 8))
+        half, turned = rng.uniform(0.02, 0.25, 2) * size, rng.uniform(0, 360)
+        if rng.random() < 0.4:
+            half = half.max() if rng.random() < 0.5 else half
+            axes = (int(v) for v in np.broadcast_to(half, 2))
+            cv2.ellipse(page, middle.astype(int).tolist(), tuple(axes), turned, 0, 360, ink, width, cv2.LINE_AA)
+        else:
+            angles = np.deg2rad(turned) + 2 * np.pi * np.arange(sides := int(rng.integers(2, 7))) / sides
+            corners = middle + half * np.stack([np.cos(angles), np.sin(angles)], -1)
+            cv2.polylines(page, [corners.astype(np.int32)], True, ink, max(width, 1), cv2.LINE_AA)
+            if width < 0:
+                cv2.fillPoly(page, [corners.astype(np.int32)], ink, cv2.LINE_AA)
+    return page.astype(np.uint8)
+
+
 def target(rng: np.random.Generator, size: int) -> np.ndarray:
     """Printed paper: rings round a middle."""
     i, j = np.mgrid[:size, :size] / size - rng.uniform(0.3, 0.7, (2, 1, 1))
@@ -111,7 +164,7 @@ class Family(NamedTuple):
     papers: tuple[Pattern, ...]
 
 
-TRAINING = Family((checker, clouds, planks, plain), (text, checker))
+TRAINING = Family((checker, clouds, planks, plain, stripes, dots, splinters, strokes), (text, checker, shapes, dots))
 EVALUATION = Family((tiles, marble, granite, weave), (target, bars))
 
 

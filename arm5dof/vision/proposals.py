@@ -22,13 +22,13 @@ def squares(boxes: np.ndarray) -> np.ndarray:
     return np.column_stack([(boxes[:, :2] + boxes[:, 2:]) / 2 - size[:, None] / 2, size])
 
 
-def crop(picture: np.ndarray, square: np.ndarray) -> np.ndarray:
+def crop(picture: np.ndarray, square: np.ndarray, between: int = cv2.INTER_LINEAR) -> np.ndarray:
     """That square of a picture, (CROP, CROP, 3) uint8. Beyond its edges it goes on as it ends."""
     left, top, size = square
     scale = size / CROP
     # OpenCV counts from the middles of pixels.
     place = np.array([[scale, 0, left + scale / 2 - 0.5], [0, scale, top + scale / 2 - 0.5]])
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    how = between | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(picture, place, (CROP, CROP), flags=how, borderMode=cv2.BORDER_REPLICATE))
 
 

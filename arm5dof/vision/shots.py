@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
+from arm5dof import xla
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.scenery import CAMERA
 from arm5dof.vision.scenes import Scene, Style, random_scene
@@ -51,7 +51,7 @@ def shots(count: int, seed: int, style: Style, back_end: BackEnd, workers: int |
 
 def in_order(function: Callable[[int], T], count: int, workers: int | None = None) -> Iterator[T]:
     """What a function makes of 0, 1, 2, ..., in as many processes as there are cores, or `workers`."""
-    with multiprocessing.get_context("spawn").Pool(min(workers or _cores(), count), _start) as pool:
+    with multiprocessing.get_context("spawn").Pool(min(workers or xla.cores(), count), _start) as pool:
         yield from pool.imap(function, range(count), chunksize=4)
 
 
@@ -63,10 +63,6 @@ def _owner(scene: Scene, segmentation: np.ndarray) -> np.ndarray:
     seen = thing[segmentation]
     number = np.cumsum(np.bincount(seen.ravel(), minlength=len(scene.things) + 1)[1:] > 0)
     return np.array([0, *number], np.uint8)[seen]
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _start() -> None:

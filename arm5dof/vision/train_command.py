@@ -29,7 +29,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.add_argument("--out", type=Path, default=Path("runs/detector"), metavar="FOLDER", help="default: runs/detector")
     p.add_argument("--seed", type=int, metavar="S", help="of all random numbers; default 0")
     p.add_argument("--scenes", type=int, metavar="N", help="pictures to draw; default 3500")
-    p.add_argument("--proposer-steps", type=int, metavar="N", help="updates of the first network; default 5000")
+    p.add_argument("--proposer-steps", type=int, metavar="N", help="updates of the first network; default 5500")
     p.add_argument("--refiner-steps", type=int, metavar="N", help="updates of the second network; default 5000")
     p.set_defaults(run=run)
 

@@ -39,7 +39,7 @@ T = TypeVar("T")
 WINDOWS, CROPS = 32, 128
 """In an update of the proposer, and of the refiner."""
 UNLIKELY = 0.02
-"""The refiner learns from what the proposer thinks less likely than it will be shown later, for it errs more there."""
+"""The refiner learns from proposals at least so likely."""
 LOG_EVERY = 100
 WARM_UP = 200
 """Steps over which the learning rate rises."""
@@ -64,7 +64,7 @@ class Budget:
     """Of all random numbers: same seed and machine, same bits."""
     scenes: int = 3500
     """Pictures drawn."""
-    proposer_steps: int = 5000
+    proposer_steps: int = 5500
     """Updates of the proposer's weights, each from 32 windows of pictures."""
     refiner_steps: int = 5000
     """Updates of the refiner's weights, each from 128 crops."""

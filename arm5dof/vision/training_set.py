@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision import patterns
 from arm5dof.vision.assignment import Labels
 from arm5dof.vision.proposals import REDUCED
 from arm5dof.vision.scenes import MOST_THINGS
@@ -101,6 +102,7 @@ def _window(data: TrainingSet, rng: np.random.Generator) -> tuple[np.ndarray, La
         _paste(data, rng, picture, owner, area)
 
     boxes, found, ignored = _labels(owner, area)
+    picture = overprinted(picture, owner, rng)
     boxes = boxes * np.float32(WINDOW / side)
     picture = np.asarray(cv2.resize(picture, (WINDOW, WINDOW), interpolation=cv2.INTER_AREA))
     for axis in (0, 1):
@@ -143,6 +145,16 @@ def _labels(owner: np.ndarray, area: list) -> Labels:
         found[row] = seen[i] >= VISIBLE * area[i]
         ignored[row] = not found[row]
     return Labels(boxes, found, ignored)
+
+
+def overprinted(picture: np.ndarray, owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Sometimes with shapes printed on everything that is none of the things, shadows and all."""
+    if rng.random() < 0.6:
+        return picture
+    height, width = owner.shape
+    sheet = cv2.resize(patterns.shapes(rng, 128), (width, height))
+    printed = cv2.multiply(picture, sheet, scale=rng.uniform(0.8, 1.6) / 255)
+    return np.asarray(cv2.copyTo(picture, (owner > 0).view(np.uint8), printed))
 
 
 def relit(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
