@@ -384,12 +384,13 @@ def test_what_proposals_are_of():
         nothing, nothing[..., 0], np.array([1, 1]), boxes, np.array([4, 6]), np.array([0.9, 0.3]), np.array([400, 400])
     )
     given = np.array([[12, 10, 32, 30], [98, 100, 120, 121], [23, 10, 43, 30], [19, 10, 40, 30], [200, 200, 220, 220]])
-    found = crops.candidates(data, 1, given)
+    found = crops.candidates(data, 1, given, np.full(len(given), 0.5))
     np.testing.assert_array_equal(found.boxes, [given[0], given[2], given[4], boxes[0]])
     np.testing.assert_array_equal(found.wanted, [boxes[0], given[2], given[4], boxes[0]])
     np.testing.assert_array_equal(found.class_id, [4, -1, -1, 4])
     assert set(found.scene) == {1}
-    assert set(crops.candidates(data, 0, given).class_id) == {-1} and len(crops.candidates(data, 0, given).boxes) == 5
+    nothing = crops.candidates(data, 0, given, np.full(len(given), 0.5))
+    assert set(nothing.class_id) == {-1} and len(nothing.boxes) == 5
 
 
 # A training in small
@@ -423,8 +424,8 @@ def test_the_proposer_learns_two_windows_by_heart(small, learner):
 
 
 def test_the_refiner_learns_some_crops_by_heart(small):
-    some = [crops.candidates(small, scene, BACKGROUND) for scene in range(8)]
-    names = ("scene", "boxes", "wanted", "class_id")
+    some = [crops.candidates(small, scene, BACKGROUND, np.full(len(BACKGROUND), 0.5)) for scene in range(8)]
+    names = ("scene", "boxes", "wanted", "class_id", "likely")
     found = crops.Candidates(*(np.concatenate([getattr(one, name) for one in some]) for name in names))
     given, (wanted, class_id) = crops.batch(small, found, (0,), 8)
     learner = Learner(Refiner(len(CLASS_NAMES), training=True), refined, given, 400, 0)

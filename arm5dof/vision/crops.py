@@ -30,34 +30,40 @@ class Candidates:
     """(n, 4) the box of the thing that is there; of background, the box itself."""
     class_id: np.ndarray
     """(n,), -1 for background."""
+    likely: np.ndarray
+    """(n,) how likely the proposer thought that there is something; 1 for true boxes."""
 
 
-def candidates(data: TrainingSet, scene: int, proposals: np.ndarray) -> Candidates:
-    """Of one scene: proposals (n, 4), and the boxes of the things. What is mostly hidden is left out."""
+def candidates(data: TrainingSet, scene: int, proposals: np.ndarray, likely: np.ndarray) -> Candidates:
+    """Of one scene: proposals (n, 4), each so likely (n,), and the boxes of the things. What is mostly hidden is left
+    out."""
     mine = np.s_[data.first(scene) : data.first(scene + 1)]
     things, class_id, counts = data.boxes[mine], data.class_id[mine], data.visible[mine] >= VISIBLE
     if not len(things):
-        return Candidates(np.full(len(proposals), scene), proposals, proposals, np.full(len(proposals), -1))
-    boxes = np.concatenate([proposals, things[counts]])
+        return Candidates(np.full(len(proposals), scene), proposals, proposals, np.full(len(proposals), -1), likely)
+    boxes, likely = np.concatenate([proposals, things[counts]]), np.concatenate([likely, np.ones(counts.sum())])
     fit = overlap(boxes, things)
     best, which = fit.max(1), fit.argmax(1)
     none = best < BACKGROUND
     wanted = np.where(none[:, None], boxes, things[which])
     taken = none | ((best >= THING) & counts[which])
-    return Candidates(
-        np.full(taken.sum(), scene), boxes[taken], wanted[taken], np.where(none, -1, class_id[which])[taken]
-    )
+    class_id = np.where(none, -1, class_id[which])
+    return Candidates(np.full(taken.sum(), scene), boxes[taken], wanted[taken], class_id[taken], likely[taken])
 
 
 def batch(
     data: TrainingSet, found: Candidates, seed: tuple[int, ...], size: int
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Crops (size, CROP, CROP, 3) uint8 and how wide they were, (size,), pixels; the boxes (size, 4) of what they show,
-    as shares of the crop, and its class (size,), -1 for background. The same seed gives the same bits."""
+    as shares of the crop, and its class (size,), -1 for background: half of them, and what the proposer is misled by
+    more often than what it is not. The same seed gives the same bits."""
     rng = np.random.default_rng(seed)
     things, background = np.flatnonzero(found.class_id >= 0), np.flatnonzero(found.class_id < 0)
     half = size // 2 if len(background) else size
-    rows = np.concatenate([rng.choice(rows, k) for rows, k in ((things, half), (background, size - half)) if k])
+    rows = rng.choice(things, half)
+    if half < size:
+        misled = found.likely[background].astype(float)
+        rows = np.concatenate([rows, rng.choice(background, size - half, p=misled / misled.sum())])
     crops, widths, wanted = zip(*(_crop(data, found, row, rng) for row in rows), strict=True)
     boxes = np.stack(wanted).astype(np.float32)
     return (np.stack(crops), np.array(widths, np.float32)), (boxes, found.class_id[rows].astype(np.int32))

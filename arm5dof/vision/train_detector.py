@@ -209,8 +209,7 @@ def proposals(data: TrainingSet, weights: dict[str, Any]) -> Candidates:
     some = []
     with Bar("proposing", len(data.pictures), "scenes") as bar:
         for scene, picture in enumerate(data.pictures):
-            proposed, _ = propose(weights, picture, UNLIKELY)
-            some.append(crops.candidates(data, scene, proposed))
+            some.append(crops.candidates(data, scene, *propose(weights, picture, UNLIKELY)))
             bar.update(scene + 1)
     return Candidates(*(np.concatenate([getattr(one, name) for one in some]) for name in asdict(some[0])))
 
