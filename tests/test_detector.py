@@ -20,6 +20,7 @@ from arm5dof.vision.detect import load
 from arm5dof.vision.detector import PROPOSALS, TRUST, TabletopDetector, load_weights, propose, refine, save_weights
 from arm5dof.vision.network import CROP, INNER, REACH, STRIDE, Proposer, Refiner, cells, enlarge, fold, patches
 from arm5dof.vision.proposals import CONTEXT, crop, squares, to_crop, to_picture
+from arm5dof.vision.shots import shots
 from arm5dof.vision.train_detector import Learner
 from arm5dof.vision.training_set import WINDOW
 
@@ -306,6 +307,25 @@ def test_the_file_says_which_detector_it_is_for(wide):
     for options in ({"class_names": ["a", "b", "c"]}, {"size": 320}):
         with pytest.raises(UserError, match="are fixed"):
             load(wide, **options)
+
+
+def test_careful_looks_find_no_less_and_their_boxes_fit_better():
+    """In scenes of training's kind, but not among those that the weights were learnt from."""
+    detectors = [load(confidence=0.1, careful=careful) for careful in (False, True)]
+    fits: list[list[float]] = [[], []]
+    for shot in shots(6, 3, "training", "software", 2):
+        for detector, fit in zip(detectors, fits, strict=True):
+            overlaps = overlap(shot.truth.xyxy[shot.truth.counts][:, None], detector(shot.picture).xyxy)
+            fit += np.max(overlaps, axis=1, initial=0).tolist()
+    once, thrice = np.array(fits)
+    assert len(once) > 10 and np.sum(thrice > 0.5) >= np.sum(once > 0.5) > 0.9 * len(once)
+    assert np.median(thrice) > np.median(once) > 0.9
+
+
+def test_only_the_tabletop_detector_can_be_careful(tmp_path):
+    (tmp_path / "other.onnx").write_bytes(b"\x08")
+    with pytest.raises(UserError, match="careful"):
+        load(tmp_path / "other.onnx", careful=True)
 
 
 def test_weights_survive_their_file(tmp_path):

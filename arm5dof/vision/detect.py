@@ -27,6 +27,7 @@ def load(
     confidence: float = 0.25,
     iou: float = 0.45,
     size: int | None = None,
+    careful: bool = False,
 ) -> Detector:
     """The detector in a file: YOLOv5's own weights (`.pt`), a network of the YOLO family as ONNX (`.onnx`), or weights
     of the tabletop detector (`.npz`). A file called otherwise is told by its content. Without one, what ships.
@@ -35,15 +36,21 @@ def load(
     confidence:  detections below are dropped
     iou:         of boxes of one class that overlap more, the best stays
     size:        side of the network's input in pixels; without it the file's, or 640 where that leaves it open
+    careful:     see `TabletopDetector`, which alone can be so, and which takes neither names nor a size
 
-    The tabletop detector takes neither names nor a size. Raises `UserError` if the file is none of these, is damaged,
+    Raises `UserError` if the file is none of these, is damaged,
     or tells apart another number of classes than are named.
     """
     path = SHIPPED if path is None else Path(path)
     if not path.is_file():
         raise UserError(f"no detector {str(path)!r}: give a .pt, .onnx or .npz file")
+    kind = _kind(path)
+    if careful and kind != ".npz":
+        raise UserError(
+            f"{path} is not the tabletop detector, which alone can look more carefully: leave --careful out"
+        )
     # Each takes its second to import, and only one is needed.
-    match _kind(path):
+    match kind:
         case ".pt":
             from arm5dof.vision.yolov5 import YOLOv5
 
@@ -57,7 +64,7 @@ def load(
 
             if class_names is not None or size is not None:
                 raise UserError(f"{path}: the tabletop detector's class names and its size are fixed: leave them out")
-            return TabletopDetector(path, confidence, iou)
+            return TabletopDetector(path, confidence, iou, careful)
         case _:
             raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt), a network as ONNX (.onnx), or .npz")
 

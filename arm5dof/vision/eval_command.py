@@ -23,7 +23,7 @@ that is so.
   arm5dof vision eval                                        what ships, on 1,000 scenes
   arm5dof vision eval --weights runs/detector/weights.npz    your own training
   arm5dof vision eval --scenes 100 --seed 7 --json
-  arm5dof vision eval --quick                                looking at things once, in half the time
+  arm5dof vision eval --careful                              looking at things three times
 
 Scenes are drawn with OpenGL where that works (see arm5dof vision doctor), otherwise in software.
 """
@@ -37,7 +37,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.add_argument("--scenes", type=int, default=1000, metavar="N", help="default 1000")
     p.add_argument("--seed", type=int, default=1, metavar="S", help="of the scenes; default 1")
     p.add_argument("--back-end", default="auto", choices=("auto", "gl", "software"), help="what draws; default auto")
-    p.add_argument("--quick", action="store_true", help="look once, at what is clearly something: faster, less exact")
+    p.add_argument("--careful", action="store_true", help="look at things three times: slower, more exact")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run)
 
@@ -53,7 +53,7 @@ def run(known: argparse.Namespace, rest: list[str]) -> None:
     from arm5dof.vision.evaluate import evaluate
 
     with Bar("evaluating", known.scenes, "scenes") as bar:
-        result = evaluate(known.weights, known.scenes, known.seed, known.back_end, known.quick, bar.update)
+        result = evaluate(known.weights, known.scenes, known.seed, known.back_end, known.careful, bar.update)
     print(json.dumps(result.as_json()) if known.json else table(result))
 
 

@@ -76,11 +76,11 @@ def evaluate(
     scenes: int,
     seed: int,
     back_end: BackEnd = "auto",
-    quick: bool = False,
+    careful: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Result:
     """Of a file of weights, or those that ship, on `scenes` pictures in the style of evaluation."""
-    unsure, detector = (TabletopDetector(weights, least, quick=quick) for least in (UNSURE, SURE))
+    unsure, detector = (TabletopDetector(weights, least, careful=careful) for least in (UNSURE, SURE))
     truths: list[Truth] = []
     found: list[Detections] = []
     pictures: list[np.ndarray] = []
