@@ -42,7 +42,8 @@ Without --out a table is printed. With it a new folder gets the images, or the v
 and detections.json: a list with an object for each frame, {"name", "time_s", "image_size", "detections"}, and in that
 for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
 
-Faster: a smaller --size. Too much is found: a higher --confidence. One thing is found twice: a lower --iou.
+Faster: a smaller --size. Too little is found: --careful, or a lower --confidence; too much: a higher one. One thing is
+found twice: a lower --iou.
 
 If an image is damaged, a video breaks off or you press Ctrl-C, the frames before are written and the files are whole;
 the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so there the exit status is 0.
@@ -64,6 +65,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.add_argument(
         "--size", type=int, metavar="PIXELS", help="side of the network's input; default: the model's, or 640"
     )
+    p.add_argument("--careful", action="store_true", help="the shipped detector looks three times, in twice the time")
     p.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder for what was found")
     p.add_argument("--json", action="store_true", help="print what goes into detections.json, frame by frame")
     p.set_defaults(run=run)
@@ -86,7 +88,7 @@ def run(known: argparse.Namespace, rest: list[str]) -> int:
     failure, seen, done, started = None, Counter[str](), 0, time.monotonic()
     with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
         bar.update(0, "reading the detector")
-        detector = load(known.detector, names, known.confidence, known.iou, known.size)
+        detector = load(known.detector, names, known.confidence, known.iou, known.size, known.careful)
         results = detect(source.frames, detector, known.classes)
         bar.update(0, "starting")
         if source.live:  # A camera shall not wait while the program for the first image is compiled.
