@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
 from arm5dof.ddpg import Networks, Training
 from arm5dof.errors import UserError
@@ -34,6 +33,8 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, read_only: bool = False) -> None:
+        import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
+
         self.folder = folder
         logging.getLogger("absl").setLevel(logging.CRITICAL)
         options = ocp.CheckpointManagerOptions(
@@ -53,6 +54,8 @@ class Checkpoints:
 
     def save(self, training: Training) -> None:
         """Write a checkpoint. It counts once it is complete; until then, and if it fails, the last one does."""
+        import orbax.checkpoint as ocp
+
         items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
         record = {name: _describe(leaves) for name, leaves in items.items()}
         failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, go on with --resume"
@@ -76,6 +79,8 @@ class Checkpoints:
         return self._read("networks", like)
 
     def _read(self, item: str, like: T) -> T:
+        import orbax.checkpoint as ocp
+
         step = self.latest
         if step is None:
             raise UserError(f"{self.folder} holds no complete checkpoint yet")
