@@ -96,11 +96,12 @@ class Trainer:
 
     def start(self) -> None:
         """Begin a new run."""
-        self.check_memory()
-        epoch = self._epoch  # Everything else is compiled while this is.
-        self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
-        self._policy_distance()
-        epoch.result()
+        with xla.uncollected():
+            self.check_memory()
+            epoch = self._epoch  # Everything else is compiled while this is.
+            self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+            self._policy_distance()
+            epoch.result()
 
     def advance(self) -> dict[str, float]:
         """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and the
