@@ -55,7 +55,7 @@ def fusion_emitters() -> dict[str, bool]:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Tracing makes many objects that stay; to search them for garbage again and again takes a fifth of its time."""
+    """Tracing makes many objects that stay: to search them for garbage again and again takes much of its time."""
     was = gc.isenabled()
     gc.disable()
     try:
