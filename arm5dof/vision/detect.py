@@ -38,7 +38,8 @@ def load(
     size:        side of the network's input in pixels; without it the file's, or 640 where that leaves it open
     careful:     see `TabletopDetector`, which alone can be so, and which takes neither names nor a size
 
-    Raises `UserError` if the file is none of these, is damaged, or tells apart another number of classes than are named.
+    Raises `UserError` if the file is none of these, is damaged, or tells apart another number of classes than are
+    named.
     """
     path = SHIPPED if path is None else Path(path)
     if not path.is_file():

@@ -102,7 +102,8 @@ def letterbox(image: np.ndarray, size: tuple[int, int], stride: int | None = Non
     """Fit an RGB uint8 image into `size` (width, height), keeping its aspect, between grey borders.
 
     With a `stride` the borders are only as wide as it takes to make width and height multiples of it, as YOLOv5 does:
-    fewer pixels to look at, and another input shape for each aspect. Without, they fill up to `size`.
+    fewer pixels to look at, and another input shape for each aspect. Without, they fill up to `size`. An image that
+    needs neither is not copied.
     """
     height, width = image.shape[:2]
     scale = min(size[0] / width, size[1] / height)
