@@ -21,7 +21,7 @@ from arm5dof import cli, progress
 from arm5dof.errors import UserError
 from arm5dof.vision.catalogue import CLASS_NAMES
 from arm5dof.vision.detect import detect, load, read_names
-from arm5dof.vision.detect_command import _interruptible
+from arm5dof.vision.detecting import interruptible
 from arm5dof.vision.detections import Detections
 from arm5dof.vision.images import read
 from arm5dof.vision.outputs import folder
@@ -410,13 +410,13 @@ def test_ctrl_c_finishes_the_files(what, status, model, tmp_path):
 def test_a_second_ctrl_c_is_heard_at_once(monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt), _interruptible() as interrupts:
+        with pytest.raises(KeyboardInterrupt), interruptible() as interrupts:
             signal.raise_signal(signal.SIGINT)
             assert interrupts
             signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with _interruptible() as interrupts:
+        with interruptible() as interrupts:
             signal.raise_signal(signal.SIGINT)
         assert not interrupts
     finally:
