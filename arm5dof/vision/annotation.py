@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -13,12 +15,16 @@ PALETTE = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
-def annotate(image: np.ndarray, detections: Detections) -> np.ndarray:
-    """A copy of an RGB uint8 image (h, w, 3) with the boxes drawn in and named, the most confident on top."""
+def annotate(image: np.ndarray, detections: Detections, labels: Sequence[str] | None = None) -> np.ndarray:
+    """A copy of an RGB uint8 image (h, w, 3) with the boxes drawn in, the most confident on top, and labelled; without
+    labels, with their classes and confidences."""
+    if labels is None:
+        each = zip(detections.data["class_name"], detections.confidence, strict=True)
+        labels = [f"{name} {confidence:.2f}" for name, confidence in each]
     image = np.ascontiguousarray(image).copy()
     height, width = image.shape[:2]
     line = max(1, round(max(height, width) / 400))
-    for one in reversed(list(detections)):
+    for one, label in reversed(list(zip(detections, labels, strict=True))):
         colour = PALETTE[int(one.class_id[0]) % len(PALETTE)]
         # Edges outside the image stay outside, at numbers that OpenCV can take.
         left, top, right, bottom = (
@@ -28,7 +34,7 @@ def annotate(image: np.ndarray, detections: Detections) -> np.ndarray:
             # The rim keeps a box in sight before things of its own colour.
             for edge, thickness in ((ink(colour), line + 2), (colour, line)):
                 cv2.rectangle(image, (left, top), (right - 1, bottom - 1), edge, thickness)
-            _label(image, f"{one.data['class_name'][0]} {one.confidence[0]:.2f}", (left, top), colour, line)
+            _label(image, label, (left, top), colour, line)
     return image
 
 

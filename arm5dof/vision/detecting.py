@@ -36,6 +36,13 @@ def add_options(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder for what was found")
 
 
+def given(known: argparse.Namespace) -> list[str]:
+    """Which of these options are not as they are by default."""
+    p = argparse.ArgumentParser(add_help=False)
+    add_options(p)
+    return [f"--{name}" for name, default in vars(p.parse_args([])).items() if getattr(known, name) != default]
+
+
 def run(known: argparse.Namespace, source: Source, outputs: AbstractContextManager[list[Write]]) -> int:
     """Detect in all frames as the options say and hand each on to the outputs; gives the exit status. Raises
     `UserError` where it cannot go on; what came before is kept."""

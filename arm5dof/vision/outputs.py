@@ -1,4 +1,4 @@
-"""Where detections go: a JSON list, a table, images or a video with the boxes drawn in.
+"""Where detections go, or the places of things: a JSON list, a table, images or a video with the boxes drawn in.
 
 Each is a context that gives a function to call with every frame and what was found in it, in turn.
 """
@@ -22,7 +22,10 @@ from arm5dof.vision.detections import Detections
 from arm5dof.vision.opencv import quiet
 from arm5dof.vision.sources import IMAGE_SUFFIXES, USUAL_RATE, Frame, Source
 
-Write = Callable[[Frame, Detections], None]
+Write = Callable[[Frame, Any], None]
+AsJSON = Callable[[Frame, Any], dict[str, Any]]
+Draw = Callable[[np.ndarray, Any], np.ndarray]
+"""Takes an RGB uint8 image (h, w, 3) and what was found in it."""
 Show = Callable[[Frame, np.ndarray], None]
 """Takes a frame and its picture with the boxes drawn in."""
 
@@ -36,11 +39,11 @@ def as_json(frame: Frame, found: Detections) -> dict[str, Any]:
 
 
 @contextmanager
-def json_list(stream: TextIO) -> Iterator[Write]:
+def json_list(stream: TextIO, as_json: AsJSON = as_json) -> Iterator[Write]:
     """A JSON list with a frame in each line, so that a program can follow it and a person can read it."""
     before = "[\n"
 
-    def write(frame: Frame, found: Detections) -> None:
+    def write(frame: Frame, found: Any) -> None:
         nonlocal before
         stream.write(before + json.dumps(as_json(frame, found)))
         stream.flush()
@@ -72,17 +75,19 @@ def table(stream: TextIO) -> Iterator[Write]:
 
 
 @contextmanager
-def folder(path: Path, source: Source) -> Iterator[Write]:
-    """A folder with `detections.json` and the frames with boxes drawn in: images named as the photographs are, or a
-    video. The folder appears when all is in it, and not at all if the block fails."""
+def folder(
+    path: Path, source: Source, list_name: str = "detections.json", as_json: AsJSON = as_json, draw: Draw = annotate
+) -> Iterator[Write]:
+    """A folder with a JSON list and the frames with boxes drawn in: images named as the photographs are, or a video.
+    The folder appears when all is in it, and not at all if the block fails."""
     with ExitStack() as stack:
         temporary = stack.enter_context(files.making(path))
-        text = stack.enter_context(open(temporary / "detections.json", "w", encoding="utf-8"))
-        note = stack.enter_context(json_list(text))
+        text = stack.enter_context(open(temporary / list_name, "w", encoding="utf-8"))
+        note = stack.enter_context(json_list(text, as_json))
         show = _images(temporary) if source.rate is None else stack.enter_context(_video(temporary, source))
 
-        def write(frame: Frame, found: Detections) -> None:
-            show(frame, annotate(frame.image, found))
+        def write(frame: Frame, found: Any) -> None:
+            show(frame, draw(frame.image, found))
             note(frame, found)
 
         yield write

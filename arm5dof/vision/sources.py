@@ -9,6 +9,7 @@ import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,6 +17,9 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision import images
 from arm5dof.vision.opencv import quiet
+
+if TYPE_CHECKING:
+    from arm5dof.vision.camera import Camera
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """What counts as a photograph in a folder; a file that is named may be called anything."""
@@ -44,6 +48,8 @@ class Frame:
     """RGB uint8 (h, w, 3)."""
     time: float | None = None
     """Seconds since the beginning of the video, or the camera's first frame; None for a photograph."""
+    camera: Camera | None = None
+    """What it was drawn for, known exactly; None for what a real camera took."""
 
 
 Frames = Generator[Frame, None, None]
@@ -61,6 +67,8 @@ class Source:
     """Frames per second of a video or camera; None for photographs, which are of many sizes."""
     live: bool = False
     """A camera: its frames come when they come, and it goes on until somebody stops it."""
+    drawn: bool = False
+    """Random scenes: each frame brings its camera."""
 
 
 def open_source(given: Sequence[str]) -> Source:
@@ -159,8 +167,8 @@ def simulated(count: int) -> Source:
     from arm5dof.vision.shots import shoot  # MuJoCo takes its time to import.
 
     names = (f"scene{number}.png" for number in range(count))
-    frames = (Frame(name, shoot(number, 0, "evaluation", "auto").picture) for number, name in enumerate(names))
-    return Source(frames, count)
+    shots = ((name, shoot(number, 0, "evaluation", "auto")) for number, name in enumerate(names))
+    return Source((Frame(name, shot.picture, camera=shot.camera) for name, shot in shots), count, drawn=True)
 
 
 def _is_video(path: Path) -> bool:
