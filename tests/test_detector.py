@@ -258,9 +258,8 @@ def test_overlapping_boxes_are_one_thing(wide):
     assert len(TabletopDetector(wide, iou=0.1)(GREY)) < len(boxes)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_mirrored_look_is_a_look_in_the_mirror(axis):
-    random = np.random.default_rng(axis)
+def test_a_mirrored_look_is_a_look_in_the_mirror():
+    random = np.random.default_rng(0)
     params = jax.tree.map(lambda x: random.normal(0, 0.1, x.shape), zeros("refiner"))
     picture = random.integers(0, 256, (480, 640, 3)).astype(np.uint8)
     low = random.uniform(20, 400, (5, 2))
@@ -268,11 +267,11 @@ def test_a_mirrored_look_is_a_look_in_the_mirror(axis):
 
     def mirror(boxes):
         boxes = boxes.copy()
-        boxes[:, [axis, axis + 2]] = (640, 480)[axis] - boxes[:, [axis + 2, axis]]
+        boxes[:, [0, 2]] = 640 - boxes[:, [2, 0]]
         return boxes
 
-    there, logits = refine(params, picture, boxes, axis)
-    mirrored, same = refine(params, np.ascontiguousarray(np.flip(picture, 1 - axis)), mirror(boxes))
+    there, logits = refine(params, picture, boxes, mirrored=True)
+    mirrored, same = refine(params, np.ascontiguousarray(picture[:, ::-1]), mirror(boxes))
     # OpenCV places pixels to a thirty-second.
     np.testing.assert_allclose(there, mirror(mirrored), atol=0.2)
     np.testing.assert_allclose(logits, same, atol=0.05)

@@ -72,7 +72,7 @@ def batch(
 def _crop(
     data: TrainingSet, found: Candidates, row: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """One, moved, turned, mirrored and in other light."""
+    """One, moved, mirrored and in other light."""
     low, high = np.split(found.boxes[row].astype(float), 2)
     middle = (low + high) / 2 + rng.uniform(-MOVED, MOVED, 2) * (high - low)
     half = (high - low) / 2 * np.exp(rng.uniform(-SCALED, SCALED, 2))
@@ -81,10 +81,7 @@ def _crop(
     owner = crop(data.owners[scene], square, cv2.INTER_NEAREST)
     seen = overprinted(crop(data.pictures[scene], square), owner, rng)
     (wanted,) = to_crop(found.wanted[row][None], square[None])
-    for axis in (0, 1):
-        if rng.random() < 0.5:
-            seen = np.flip(seen, 1 - axis)
-            wanted[[axis, axis + 2]] = 1 - wanted[[axis + 2, axis]]
-    if rng.random() < 0.5:
-        seen, wanted = seen.transpose(1, 0, 2), wanted[[1, 0, 3, 2]]
+    if rng.random() < 0.5:  # Only left and right: no camera hangs upside down, and light comes from above.
+        seen = np.flip(seen, 1)
+        wanted[[0, 2]] = 1 - wanted[[2, 0]]
     return relit(np.ascontiguousarray(seen), rng), float(square[2]), np.clip(wanted, -0.5, 1.5)

@@ -63,8 +63,8 @@ class TabletopDetector:
     weights:     a file that `arm5dof vision train` wrote; without it, the one that ships
     confidence:  detections below are dropped
     iou:         of boxes that overlap more the best stays, whatever their classes: a thing is of one class
-    careful:     look at less likely proposals too, and at what may be a thing twice more, mirrored one way and the
-                 other, from where it then seems to be: more is found, and boxes fit better, in twice the time
+    careful:     look at less likely proposals too, and at what may be a thing twice more, first mirrored, from where it
+                 then seems to be: more is found, and boxes fit better, in twice the time
 
     Raises `UserError` if the file is missing, damaged or of another network.
     """
@@ -90,8 +90,8 @@ class TabletopDetector:
         if self._careful:
             again = self._best(boxes, logits, likely, LEAST)
             boxes, logits, likely = boxes[again], logits[again], likely[again]
-            once, first = look(boxes, 0)
-            twice, second = look(once, 1)
+            once, first = look(boxes, mirrored=True)
+            twice, second = look(once)
             boxes, logits = (once + twice) / 2, (logits + first + second) / 3
         found = self._best(boxes, logits, likely, self._confidence)
         scores = confidences(logits[found], likely[found])
@@ -122,10 +122,10 @@ def propose(params: dict[str, Any], picture: np.ndarray, least: float = LIKELY) 
 
 
 def refine(
-    params: dict[str, Any], picture: np.ndarray, proposed: np.ndarray, mirrored: int | None = None
+    params: dict[str, Any], picture: np.ndarray, proposed: np.ndarray, mirrored: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Boxes (n, 4), pixels, and logits (n, classes) of what lies in the proposed boxes (n, 4), looked at as it is or
-    `mirrored` along an axis: 0 is x, 1 is y."""
+    mirrored, left and right."""
     count, classes = len(proposed), params["logits"]["bias"].size
     if not count:
         return np.empty((0, 4)), np.empty((0, classes))
@@ -133,13 +133,13 @@ def refine(
 
     def look(rows: np.ndarray) -> list[np.ndarray]:
         crops = np.stack([crop(picture, where[i]) for i in rows])
-        crops = crops if mirrored is None else np.flip(crops, 2 - mirrored)
+        crops = np.flip(crops, 2) if mirrored else crops
         return [np.asarray(x) for x in _refiner()(params, crops, where[rows, 2].astype(np.float32))]
 
     rows = np.minimum(np.arange(-(-count // TOGETHER) * TOGETHER), count - 1).reshape(-1, TOGETHER)
     shares, logits = (np.concatenate(parts)[:count] for parts in zip(*_threads().map(look, rows), strict=True))
-    if mirrored is not None:
-        shares[:, [mirrored, mirrored + 2]] = 1 - shares[:, [mirrored + 2, mirrored]]
+    if mirrored:
+        shares[:, [0, 2]] = 1 - shares[:, [2, 0]]
     return to_picture(shares, where), logits
 
 

@@ -105,15 +105,14 @@ def _window(data: TrainingSet, rng: np.random.Generator) -> tuple[np.ndarray, La
     picture = overprinted(picture, owner, rng)
     boxes = boxes * np.float32(WINDOW / side)
     picture = np.asarray(cv2.resize(picture, (WINDOW, WINDOW), interpolation=cv2.INTER_AREA))
-    for axis in (0, 1):
-        if rng.random() < (0.5, 0.2)[axis]:
-            picture = np.flip(picture, 1 - axis)
-            boxes[:, [axis, axis + 2]] = WINDOW - boxes[:, [axis + 2, axis]]
+    if rng.random() < 0.5:
+        picture = np.flip(picture, 1)
+        boxes[:, [0, 2]] = WINDOW - boxes[:, [2, 0]]
     return relit(np.ascontiguousarray(picture), rng), Labels(boxes, found, ignored)
 
 
 def _paste(data: TrainingSet, rng: np.random.Generator, picture: np.ndarray, owner: np.ndarray, area: list) -> None:
-    """Put a thing of any picture where there is none, mirrored, turned by right angles, lighter or darker."""
+    """Put a thing of any picture where there is none, mirrored, lighter or darker."""
     thing = rng.integers(len(data.scene))
     if data.visible[thing] < WHOLE:
         return
@@ -123,8 +122,6 @@ def _paste(data: TrainingSet, rng: np.random.Generator, picture: np.ndarray, own
     colours = np.clip(data.pictures[part] * rng.uniform(0.7, 1.3), 0, 255).astype(np.uint8)
     if rng.random() < 0.5:
         mask, colours = mask[:, ::-1], colours[:, ::-1]
-    turns = int(rng.integers(4))
-    mask, colours = np.rot90(mask, turns), np.rot90(colours, turns)
     y, x = rng.integers(0, np.array(owner.shape) - mask.shape)
     place = np.s_[y : y + mask.shape[0], x : x + mask.shape[1]]
     if not owner[place].any():
@@ -149,7 +146,7 @@ def _labels(owner: np.ndarray, area: list) -> Labels:
 
 def overprinted(picture: np.ndarray, owner: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Sometimes with shapes printed on everything that is none of the things, shadows and all."""
-    if rng.random() < 0.6:
+    if rng.random() < 0.75:
         return picture
     height, width = owner.shape
     sheet = cv2.resize(patterns.shapes(rng, 128), (width, height))
