@@ -33,8 +33,9 @@ SIZE = (640, 480)
 """Width and height of the pictures that it looks at, pixels. Other images are fitted in."""
 PROPOSALS = 40
 """The most that are looked at closely."""
-LIKELY, POSSIBLE = 0.1, 0.01
-"""Proposals less so are not; the second is for a careful look."""
+LIKELY, POSSIBLE = 0.07, 0.01
+"""Proposals less so are not looked at, but for a careful look, or where they make up a call of the refiner: those less
+than the second never."""
 APART = 0.6
 """Of proposals that overlap more the likeliest is looked at."""
 TRUST = 0.4
@@ -85,7 +86,10 @@ class TabletopDetector:
         """Detections in an RGB uint8 image (h, w, 3)."""
         boxed = letterbox(rgb(image), SIZE)
         look = partial(refine, self._params["refiner"], boxed.image)
-        proposed, likely = propose(self._params["proposer"], boxed.image, POSSIBLE if self._careful else LIKELY)
+        proposed, likely = propose(self._params["proposer"], boxed.image)
+        if not self._careful:
+            count = -(-np.count_nonzero(likely >= LIKELY) // TOGETHER) * TOGETHER
+            proposed, likely = proposed[:count], likely[:count]
         boxes, logits = look(proposed)
         if self._careful:
             again = self._best(boxes, logits, likely, LEAST)
@@ -110,7 +114,7 @@ def confidences(logits: np.ndarray, likely: np.ndarray) -> np.ndarray:
     return np.asarray((1 + np.exp(-logits)) ** (TRUST - 1) * likely[:, None] ** TRUST)
 
 
-def propose(params: dict[str, Any], picture: np.ndarray, least: float = LIKELY) -> tuple[np.ndarray, np.ndarray]:
+def propose(params: dict[str, Any], picture: np.ndarray, least: float = POSSIBLE) -> tuple[np.ndarray, np.ndarray]:
     """Boxes (n, 4) of what may be things in a picture, pixels, and how likely they are (n,), the likeliest first and
     none less than `least`."""
     reduced = cv2.resize(picture, REDUCED, interpolation=cv2.INTER_AREA)

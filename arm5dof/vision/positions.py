@@ -22,9 +22,9 @@ from arm5dof.vision.solid import CATALOGUE_SOLIDS, Solid
 from arm5dof.vision.truth import Truth, truth
 from arm5dof.vision.views import by_views
 
-EDGES = 1.0
+EDGES = 0.9
 """What is said of the edges of the detector's boxes, as a standard deviation, pixels. Most are nearer, as if it were
-0.8; with those round half-hidden things it is 1.4."""
+0.8; with those round half-hidden things it is 1.2."""
 SHARED, NOISE = 2e-3, 2e-3
 """Standard deviations of what depth images are off by, as a whole and in each pixel, metres."""
 LEVELS = {"68": 3.5267, "95": 7.8147}
