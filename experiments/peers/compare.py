@@ -1,6 +1,6 @@
 """Ours and the peers, one after the other on this machine: time and transitions to 95.5 % within 10 mm.
 
-    python experiments/peers/compare.py --peers-python PATH [--seeds 3] [--minutes 3] [--only sbx-TD3 ...] [--again]
+    python experiments/peers/compare.py --peers-python PATH [--seeds 3] [--minutes 5] [--only sbx-TD3 ...] [--again]
 
 Runs in our own environment; `--peers-python` is the interpreter of the peers' (requirements.txt). Learning curves are
 left in experiments/results/peers/*.csv, and those that are there already are not run again; the table and the figure,
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--peers-python", default="", help="the interpreter of the peers' environment")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--minutes", type=float, default=3, help="a peer's budget")
+    parser.add_argument("--minutes", type=float, default=5, help="a peer's budget")
     parser.add_argument("--only", nargs="*", choices=[*OURS, *SETTINGS], default=[*OURS, *SETTINGS])
     parser.add_argument("--again", action="store_true", help="run what is there already, too")
     arguments = parser.parse_args()
