@@ -321,6 +321,13 @@ def test_careful_looks_find_no_less_and_their_boxes_fit_better():
     assert np.median(thrice) > np.median(once) > 0.9
 
 
+def test_only_careful_looks_are_for_the_unlikely(tmp_path):
+    """Between the two thresholds is 0.03."""
+    save_weights(tmp_path / "weak.npz", weights_of(16, np.log(0.03 / 0.97), 2.0), ("cube", "ball", "ring"))
+    quick, careful = (TabletopDetector(tmp_path / "weak.npz", 0.1, careful=careful) for careful in (False, True))
+    assert len(quick(GREY)) == 0 < len(careful(GREY))
+
+
 def test_only_the_tabletop_detector_can_be_careful(tmp_path):
     (tmp_path / "other.onnx").write_bytes(b"\x08")
     with pytest.raises(UserError, match="careful"):
