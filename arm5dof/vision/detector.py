@@ -88,7 +88,7 @@ class TabletopDetector:
         look = partial(refine, self._params["refiner"], boxed.image)
         proposed, likely = propose(self._params["proposer"], boxed.image)
         if not self._careful:
-            count = -(-np.count_nonzero(likely >= LIKELY) // TOGETHER) * TOGETHER
+            count = _filled(int(np.count_nonzero(likely >= LIKELY)))
             proposed, likely = proposed[:count], likely[:count]
         boxes, logits = look(proposed)
         if self._careful:
@@ -140,11 +140,16 @@ def refine(
         crops = np.flip(crops, 2) if mirrored else crops
         return [np.asarray(x) for x in _refiner()(params, crops, where[rows, 2].astype(np.float32))]
 
-    rows = np.minimum(np.arange(-(-count // TOGETHER) * TOGETHER), count - 1).reshape(-1, TOGETHER)
+    rows = np.minimum(np.arange(_filled(count)), count - 1).reshape(-1, TOGETHER)
     shares, logits = (np.concatenate(parts)[:count] for parts in zip(*_threads().map(look, rows), strict=True))
     if mirrored:
         shares[:, [0, 2]] = 1 - shares[:, [2, 0]]
     return to_picture(shares, where), logits
+
+
+def _filled(count: int) -> int:
+    """How many crops the calls hold that so many take."""
+    return -(-count // TOGETHER) * TOGETHER
 
 
 @cache

@@ -22,8 +22,7 @@ from pathlib import Path
 # - DDPG: step size 1e-3 before 3e-3. SAC needs a small entropy coefficient.
 # - Hindsight, with goals from the same episode: half as many updates again or fewer for the same accuracy, then
 #   accuracy goes up and down, which is what the falling step size is for. DDPG ends at 94.6 % if it falls within
-#   100,000 updates, and at 86.9 to 95.5 % within 140,000, which are three minutes, and at
-#   94.1 to 96.3 % within 200,000.
+#   100,000 updates, at 86.9 to 95.5 % within 140,000 (three minutes), at 94.1 to 96.3 % within 200,000.
 # - XLA without its fusion emitters, as ours: no difference for sbx, slower for rejax; they keep jax's own choice.
 SBX = {
     "learning_rate": 1e-3,
