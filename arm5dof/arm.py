@@ -7,8 +7,9 @@ model holds (a gripper, a table, free objects) is left alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,9 @@ import numpy as np
 
 from arm5dof import files
 from arm5dof.errors import UserError
-from arm5dof.mjx import mjx
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -38,7 +41,6 @@ class Arm:
     """
 
     mj_model: mujoco.MjModel
-    mjx_model: mjx.Model
     joints: np.ndarray
     """Joint ids, (dof,)."""
     qpos: np.ndarray
@@ -54,12 +56,21 @@ class Arm:
     lower: np.ndarray
     upper: np.ndarray
     """Joint limits, (dof,), narrowed to what the position actuators can be told."""
-    rest: np.ndarray
-    """The model's `qpos0`, every coordinate of the scene, (nq,)."""
     chain: tuple[Link, ...]
     """What stands between the joints, (dof + 1,): the last leads from the last joint to the site."""
     reach: float
     """An upper bound on the distance between the first joint and the end effector, metres."""
+
+    @cached_property
+    def mjx_model(self) -> mjx.Model:
+        """The model as MJX has it. Raises `UserError` if it has something that MJX cannot simulate."""
+        from arm5dof.mjx import mjx  # Half a second to import, and nothing but servo dynamics needs it.
+
+        try:
+            with jax.ensure_compile_time_eval():  # It may be wanted first while a program is traced.
+                return mjx.put_model(self.mj_model)
+        except NotImplementedError as error:
+            raise UserError(f"MJX cannot simulate this model ({error}): change it, or use kinematic dynamics") from None
 
     @property
     def dof(self) -> int:
@@ -77,13 +88,6 @@ class Arm:
         data = mujoco.MjData(self.mj_model)
         mujoco.mj_kinematics(self.mj_model, data)
         return data.xanchor[self.joints[0]].copy()
-
-    def make_data(self, q: jax.Array) -> mjx.Data:
-        """Simulation data at joint positions `q`, everything else at rest; what follows from positions (`xpos` and
-        the like) is not computed. Call it inside `jit`: eager MJX data carries other types than a step returns, and
-        the next call would compile again."""
-        qpos = jnp.asarray(self.rest, jnp.float32).at[self.qpos].set(q)
-        return mjx.make_data(self.mjx_model).replace(qpos=qpos)
 
     def forward(self, q: jax.Array) -> jax.Array:
         """Position of the end-effector site, (..., 3), at joint positions `q` (..., dof). Differentiable."""
@@ -188,7 +192,6 @@ def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
     travel = np.abs(model.jnt_range[slides] - zero[:, None]).max(-1, initial=0) + np.abs(zero)
     return Arm(
         mj_model=model,
-        mjx_model=mjx.put_model(model),
         joints=ids,
         qpos=model.jnt_qposadr[ids],
         dofs=model.jnt_dofadr[ids],
@@ -197,7 +200,6 @@ def load(source: str | Path | mujoco.MjSpec, site: str = "ee") -> Arm:
         site=site_id,
         lower=lower,
         upper=upper,
-        rest=model.qpos0.copy(),
         chain=chain,
         reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + travel.sum()),
     )

@@ -71,15 +71,14 @@ def bare(envs: int, steps: int = 20) -> dict[str, float | str]:
 
     loaded = arm.load("reach.xml")
     q = loaded.sample(jax.random.key(0), (envs,))
+    place = lambda q, d: d.replace(qpos=d.qpos.at[loaded.qpos].set(q))
     found: dict[str, float | str] = {}
     for back_end in ("jax", "warp"):
         name = f"bare mjx.step/s, {back_end}"
         try:
             model = mjx.put_model(loaded.mj_model, impl=back_end)
             step = jax.vmap(lambda d, model=model: mjx.step(model, d))
-            start = lambda q, impl=back_end: mjx.make_data(loaded.mj_model, impl=impl).replace(
-                qpos=jax.numpy.asarray(loaded.rest, "float32").at[loaded.qpos].set(q)
-            )
+            start = lambda q, impl=back_end: place(q, mjx.make_data(loaded.mj_model, impl=impl))
             data = jax.jit(jax.vmap(start))(q)
             run = jax.jit(lambda d, step=step: jax.lax.scan(lambda d, _: (step(d), None), d, None, steps)[0])
             jax.block_until_ready(run(data))

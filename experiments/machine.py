@@ -50,10 +50,10 @@ def env(batch: int = 1024, steps: int = 20) -> dict[str, float]:
     """Physics steps per second of the servo environment, resets and observations included, and of bare
     `vmap(mjx.step)` in a `scan`."""
     import jax
-    import jax.numpy as jnp
 
     from arm5dof.envs import VectorEnv
     from arm5dof.mjx import mjx
+    from arm5dof.physics import FIELDS
 
     task = reach()
     substeps, model = task.config.substeps, task.arm.mjx_model
@@ -63,7 +63,8 @@ def env(batch: int = 1024, steps: int = 20) -> dict[str, float]:
     ours = jax.jit(lambda state, actions: jax.lax.scan(lambda s, a: (vector.step(s, a), None), state, actions)[0])
     bare_step = jax.vmap(lambda data: mjx.step(model, data))
     bare = jax.jit(lambda data: jax.lax.scan(lambda d, _: (bare_step(d), None), data, None, steps * substeps)[0])
-    data = state.data.replace(ctrl=jnp.asarray(state.data.ctrl))
+    kept = {name: getattr(state.data, name) for name in FIELDS}
+    data = jax.jit(jax.vmap(lambda kept: mjx.make_data(model).replace(**kept)))(kept)
     total = batch * steps * substeps
     # In turns, so that both see the same machine.
     pairs = [(seconds(lambda: bare(data), 1), seconds(lambda: ours(state, actions), 1)) for _ in range(REPEATS)]
@@ -81,11 +82,12 @@ def flag(batch: int = 1024, steps: int = 50) -> dict[str, float]:
 
     from arm5dof.mjx import mjx
 
-    task = reach()
-    state = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.key(0), batch))
-    step = jax.vmap(lambda data: mjx.step(task.arm.mjx_model, data))
+    model = reach().arm.mjx_model
+    start = jax.jit(jax.vmap(lambda ctrl: mjx.make_data(model).replace(ctrl=ctrl)))
+    data = start(jax.random.uniform(jax.random.key(0), (batch, model.nu), minval=-1.0, maxval=1.0))
+    step = jax.vmap(lambda data: mjx.step(model, data))
     run = jax.jit(lambda data: jax.lax.scan(lambda d, _: (step(d), None), data, None, steps)[0])
-    return {"steps/s": batch * steps / seconds(lambda: run(state.data))}
+    return {"steps/s": batch * steps / seconds(lambda: run(data))}
 
 
 def update() -> dict[str, float]:
@@ -212,6 +214,9 @@ def replay() -> dict[str, float]:
 
 def first_step() -> dict[str, float]:
     """Compile the default experiment's program and take one step of every environment, gradient steps included."""
+    from arm5dof import xla
+
+    xla.enable_compilation_cache()
     from arm5dof import config, run
 
     trainer = run.make_trainer(config.load("reach.toml", {"epoch_steps": "1"}))
@@ -226,9 +231,13 @@ def bare_step() -> dict[str, float]:
 
     from arm5dof.mjx import mjx
 
-    task = reach()
-    start = jax.jit(jax.vmap(lambda q: mjx.step(task.arm.mjx_model, task.arm.make_data(q))))
-    jax.block_until_ready(start(task.arm.sample(jax.random.key(0), (50,))))
+    arm = reach().arm
+
+    def step(q: jax.Array) -> mjx.Data:
+        data = mjx.make_data(arm.mjx_model)
+        return mjx.step(arm.mjx_model, data.replace(qpos=data.qpos.at[arm.qpos].set(q)))
+
+    jax.block_until_ready(jax.jit(jax.vmap(step))(arm.sample(jax.random.key(0), (50,))))
     return {}
 
 

@@ -12,7 +12,7 @@ from annotated_types import Ge
 from arm5dof.arm import Arm
 from arm5dof.envs.base import Observation, State
 from arm5dof.errors import UserError
-from arm5dof.mjx import mjx
+from arm5dof.physics import Physics
 from arm5dof.settings import settings, static
 
 
@@ -60,6 +60,16 @@ class Reach:
         self._marker = int(arm.mj_model.body_mocapid[body]) if body >= 0 else -1
 
     @property
+    def identity(self) -> tuple[object, ...] | None:
+        """All that the environment's functions depend on but their source; None where that is not ours."""
+        return (self.arm.mj_model, self.arm.site, self.config) if type(self) is Reach else None
+
+    def check(self) -> None:
+        """Raises `UserError` if MJX is to simulate the arm and cannot."""
+        if self.config.dynamics == "servo":
+            _ = self.arm.mjx_model
+
+    @property
     def action_size(self) -> int:
         return self.arm.dof
 
@@ -73,9 +83,9 @@ class Reach:
         return self.arm.forward(self.arm.sample(key))
 
     def start(self, q: jax.Array, goal: jax.Array) -> State:
-        """The state at rest in pose `q` (dof,) with goal (3,) in metres. As after MJX's own steps, `data` holds what
-        follows from positions (`xpos` and the like) as it was before they changed, or not at all."""
-        data = self.arm.make_data(q)
+        """The state at rest in pose `q` (dof,) with goal (3,) in metres."""
+        data = Physics.at_rest(self.arm.mj_model)
+        data = data.replace(qpos=data.qpos.at[self.arm.qpos].set(q))
         if self._marker >= 0:
             data = data.replace(mocap_pos=data.mocap_pos.at[self._marker].set(goal))
         obs, distance = self._observe(data, goal)
@@ -88,7 +98,7 @@ class Reach:
         data, goal = state.data, state.info["goal"]
         if self.config.dynamics == "servo":
             data = data.replace(ctrl=data.ctrl.at[self.arm.actuators].set(self.arm.to_ctrl(target)))
-            data = jax.lax.fori_loop(0, self.config.substeps, lambda _, d: mjx.step(self.arm.mjx_model, d), data)
+            data = jax.lax.fori_loop(0, self.config.substeps, lambda _, d: d.step(self.arm.mjx_model), data)
         else:
             data = data.replace(qpos=data.qpos.at[self.arm.qpos].set(target))
         obs, distance = self._observe(data, goal)
@@ -120,7 +130,7 @@ class Reach:
         target = obs["privileged_state"][-3:]
         return jnp.concatenate([action, end_effector, target, end_effector - target])
 
-    def _observe(self, data: mjx.Data, goal: jax.Array) -> tuple[Observation, jax.Array]:
+    def _observe(self, data: Physics, goal: jax.Array) -> tuple[Observation, jax.Array]:
         """The observation, and the distance between end effector and goal in metres."""
         pose = data.qpos[self.arm.qpos]
         position = self.arm.forward(pose)
