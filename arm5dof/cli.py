@@ -93,17 +93,19 @@ def train(known: argparse.Namespace, rest: list[str]) -> None:
         if others:
             raise UserError(f"--resume goes on with a run as it was configured; leave out {', '.join(others)}")
         current = run.Run.open(known.resume)
+        trainer = None
     else:
         experiment = experiment or "reach.toml"
         given = {name.replace("-", "_").rsplit(".", 1)[-1] for name in overrides}
         smoke = {k: v for k, v in SMOKE.items() if k not in given} if known.smoke else {}
         settings = config.load(experiment, {**smoke, **overrides})
         # What is wrong with the arm or the budget is said before a folder exists.
-        run.make_trainer(settings).check_memory()
+        trainer = run.make_trainer(settings)
+        trainer.check()
         out = known.out or run.free_folder(Path(experiment).stem + ("-smoke" if known.smoke else ""))
         current = run.Run.create(settings, out)
     print(f"run {current.folder} on {run.device()}", file=sys.stderr)
-    evaluations = run.train(current)
+    evaluations = run.train(current, trainer)
     from arm5dof.evaluate import table
 
     print(table({name: evaluations[-1][name] for name in ("one_shot", "refined", "episode")}))

@@ -88,15 +88,15 @@ def make_trainer(settings: Config) -> training.Trainer:
     return training.Trainer(Reach(arm.load(settings.env.arm, settings.env.site), settings.env), settings)
 
 
-def train(run: Run) -> list[dict[str, Any]]:
-    """Train a run to its end, from its newest checkpoint if it has one. Returns its evaluations."""
+def train(run: Run, trainer: training.Trainer | None = None) -> list[dict[str, Any]]:
+    """Train a run to its end, from its newest checkpoint if it has one; `trainer` is its training program, if it has
+    been made already. Returns its evaluations."""
     with run.locked():
-        return _train(run)
+        return _train(run, trainer or make_trainer(run.config))
 
 
-def _train(run: Run) -> list[dict[str, Any]]:
+def _train(run: Run, trainer: training.Trainer) -> list[dict[str, Any]]:
     budget = run.config.train
-    trainer = make_trainer(run.config)
     checkpoints = Checkpoints(run.folder / "checkpoints")
     length = run.config.env.episode_length
     with Bar("training", budget.episodes, "episodes") as bar:

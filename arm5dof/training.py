@@ -16,6 +16,7 @@ from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Reach
 from arm5dof.errors import UserError
 from arm5dof.policy import Policy
+from arm5dof.programs import Program
 from arm5dof.settings import settings, static
 
 Count = Annotated[int, Ge(1)]
@@ -85,37 +86,60 @@ class Trainer:
         """Shapes and types of the state."""
         return self._init.eval_shape(self.config.ddpg, jax.random.key(0))
 
-    def check_memory(self) -> None:
-        """Raises `UserError` if the replay buffer cannot fit into the device's memory."""
+    def check(self) -> None:
+        """Raises `UserError` if the replay buffer cannot fit into the device's memory, or the arm has something that
+        its dynamics cannot simulate."""
         needed, free = self.replay_bytes, memory_free()
         if needed > free:
             raise UserError(
                 f"replay_capacity = {self.config.ddpg.replay_capacity} takes {needed / 1e9:.1f} GB and "
                 f"{free / 1e9:.1f} GB are free: choose a smaller one"
             )
+        if self._program.kept is None:  # Else it has been simulated before.
+            self.env.check()
 
     def start(self) -> None:
         """Begin a new run."""
         with xla.uncollected():
-            self.check_memory()
+            self.check()
             epoch = self._epoch  # Everything else is compiled while this is.
-            self.state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+            state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+            # Bound to its device, as epochs return it: the policy would be compiled once for either.
+            self.state = jax.tree.map(lambda x: jax.device_put(x, x.sharding), state)
             self._policy_distance()
             epoch.result()
 
     def advance(self) -> dict[str, float]:
         """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and the
         mean distance in metres by which one answer of the policy, without noise, misses a few hundred targets."""
-        self.state, metrics = self._epoch.result()(self.config.ddpg, self.state)
+        leaves, metrics = self._epoch.result()(*self._leaves(self.state))
+        self.state = jax.tree.unflatten(jax.tree.structure(self.like), leaves)
         metrics["policy_distance"] = self._policy_distance()
         return {name: float(value) for name, value in jax.device_get(metrics).items()}
 
     @cached_property
+    def _program(self) -> Program:
+        """An epoch, from and to the leaves of the state."""
+        config, state = jax.tree.structure(self.config.ddpg), jax.tree.structure(self.like)
+        steps = self.config.train.epoch_steps
+
+        def epoch(numbers: list[float], leaves: list[jax.Array]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+            training = jax.tree.unflatten(state, leaves)
+            training, metrics = self.agent.epoch(jax.tree.unflatten(config, numbers), training, steps)
+            return jax.tree.leaves(training), metrics
+
+        known = self.env.identity
+        identity = None if known is None else (*known, config, self.total_steps, steps)
+        return Program(epoch, self._leaves(self.like), identity)
+
+    def _leaves(self, state: Training) -> tuple[list[float], list[jax.Array]]:
+        return jax.tree.leaves(self.config.ddpg), jax.tree.leaves(state)
+
+    @cached_property
     def _epoch(self) -> Future[jax.stages.Compiled]:
-        """The program of an epoch, compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
-        epoch = jax.jit(self.agent.epoch, static_argnums=2, donate_argnums=1, compiler_options=xla.effort(2))
-        lower, arguments = epoch.lower, (self.config.ddpg, self.like, self.config.train.epoch_steps)
-        return ThreadPoolExecutor(1).submit(lambda: lower(*arguments).compile())
+        """Compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
+        epoch = self._program.jit(donate_argnums=1, compiler_options=xla.effort(2))
+        return ThreadPoolExecutor(1).submit(epoch.lower(*self._leaves(self.like)).compile)
 
     def _policy_distance(self) -> jax.Array:
         policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)

@@ -70,9 +70,21 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+_programs: Path | None = None
+
+
 def enable_compilation_cache() -> None:
-    """Keep compiled programs on disk between runs, unless the user has said where or that they want none."""
+    """Keep compiled and traced programs on disk between runs, unless the user has said where or wants none."""
+    global _programs
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(root / "arm5dof" / "xla")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    _programs = Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "traced"
+
+
+def programs_folder() -> Path | None:
+    """Where traced programs are kept, or None if they are not."""
+    import jax
+
+    return _programs if jax.config.values["jax_enable_compilation_cache"] else None

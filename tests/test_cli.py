@@ -196,6 +196,12 @@ def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
             '<joint name="a" range="-1 1"/><geom size="1"/><site name="ee"/></body></worldbody></mujoco>',
             "no position actuator",
         ),
+        (
+            "implicit.xml",
+            '<mujoco><option integrator="implicit"/><worldbody><body><joint name="a" range="-1 1"/><geom size="1"/>'
+            '<site name="ee"/></body></worldbody><actuator><position joint="a"/></actuator></mujoco>',
+            "MJX cannot simulate this model",
+        ),
     ]:
         (tmp_path / name).write_text(text)
         assert said in fails("train", "--arm", name)
