@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -76,11 +77,15 @@ _programs: Path | None = None
 def enable_compilation_cache() -> None:
     """Keep compiled and traced programs on disk between runs, unless the user has said where or wants none."""
     global _programs
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(root / "arm5dof" / "xla")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-    _programs = Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "traced"
+    root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(root / "arm5dof" / "xla"))
+    seconds = os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    if "jax" in sys.modules:  # It has read its environment already.
+        import jax
+
+        jax.config.update("jax_compilation_cache_dir", folder)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", float(seconds))
+    _programs = Path(folder) / "traced"
 
 
 def programs_folder() -> Path | None:

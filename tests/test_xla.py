@@ -43,3 +43,24 @@ def test_one_program_may_choose_for_itself():
     assert done.stdout.split()[-1] == "0.0"
     known = xla.flags("", metadata.version("jaxlib")) != ""
     assert ("True" in done.stdout) == known
+
+
+@pytest.mark.parametrize("first", ["import jax;", ""])
+def test_programs_are_kept_in_the_cache_folder(first, tmp_path):
+    """Whether or not JAX was imported before; where the user wants it, and not at all if they do not."""
+    code = (
+        f"{first}from arm5dof import xla; xla.enable_compilation_cache(); import jax;"
+        "print(jax.config.jax_compilation_cache_dir, xla.programs_folder())"
+    )
+    unset = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+
+    def folders(**environment: str) -> list[str]:
+        done = subprocess.run(
+            [sys.executable, "-c", code], env={**unset, **environment}, capture_output=True, text=True, check=True
+        )
+        return done.stdout.split()
+
+    default = str(tmp_path / "arm5dof" / "xla")
+    assert folders(XDG_CACHE_HOME=str(tmp_path)) == [default, f"{default}/traced"]
+    assert folders(JAX_COMPILATION_CACHE_DIR="/somewhere") == ["/somewhere", "/somewhere/traced"]
+    assert folders(JAX_ENABLE_COMPILATION_CACHE="false")[1] == "None"
