@@ -257,17 +257,18 @@ def alone(part: str, cache: Path | None = None, **environment: str) -> tuple[dic
 
 def starts() -> dict[str, float]:
     """Whole processes, from their start to the first gradient steps, against one that compiles `mjx.step` alone."""
+    turns = []
     with tempfile.TemporaryDirectory() as folder:
-        bare = [alone("bare_step")[1] for _ in range(3)]
-        cold = [alone("first_step", Path(folder) / str(i))[1] for i in range(3)]
-        warm = [alone("first_step", Path(folder) / "0")[1] for _ in range(3)]
-    cold_s, warm_s, bare_s = map(statistics.median, (cold, warm, bare))
+        for i in range(REPEATS):  # In turns, so that all see the same machine.
+            cache = Path(folder) / str(i)
+            turns.append([alone(*what)[1] for what in (("bare_step",), ("first_step", cache), ("first_step", cache))])
+    median = statistics.median
     return {
-        "bare mjx.step, s": bare_s,
-        "cold start, s": cold_s,
-        "warm start, s": warm_s,
-        "cold / bare": cold_s / bare_s,
-        "warm / cold": warm_s / cold_s,
+        "bare mjx.step, s": median(bare for bare, _, _ in turns),
+        "cold start, s": median(cold for _, cold, _ in turns),
+        "warm start, s": median(warm for _, _, warm in turns),
+        "cold / bare": median(cold / bare for bare, cold, _ in turns),
+        "warm / cold": median(warm / cold for _, cold, warm in turns),
     }
 
 
