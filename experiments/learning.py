@@ -38,6 +38,7 @@ BUDGETS = {
 }
 
 BASE = "kinematic.toml --episodes 100"
+SHORT = "kinematic.toml --episodes 25 --num-envs 25"
 ABLATIONS = {
     "the recipe": BASE,
     "no random actions": f"{BASE} --random 0",
@@ -62,6 +63,9 @@ ABLATIONS = {
     "constant noise of 0.5": f"{BASE} --final-noise 0.5",
     "no noise": f"{BASE} --noise 0 --final-noise 0",
     "the paper's observations": f"{BASE} --observation paper",
+    "25 episodes": SHORT,
+    "25 episodes, Adam's usual memory of 0.999": f"{SHORT} --adam-b2 0.999",
+    "25 episodes, all goals relabelled": f"{SHORT} --relabel 1",
 }
 
 TEN_SEEDS = ("100 episodes, kinematic",)
