@@ -1,6 +1,6 @@
 """arm5dof: massively parallel training of vision-guided robot arms in JAX and MJX."""
 
-from arm5dof import xla
+from arm5dof.runtime import xla
 
 xla.configure()
 

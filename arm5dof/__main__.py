@@ -2,6 +2,6 @@
 
 import sys
 
-from arm5dof.cli import main
+from arm5dof.cli.main import main
 
 sys.exit(main())

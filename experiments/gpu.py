@@ -25,7 +25,7 @@ def measure(envs: int, length: int) -> dict[str, float | str]:
     """Control steps per second with learning on and off, and seconds after compilation to each of the goals."""
     import jax
 
-    from arm5dof import config, evaluate, run
+    from arm5dof.training import config, evaluate, run
 
     size = {name: str(envs) for name in ("num_envs", "episodes", "evaluate_every", "checkpoint_every")}
     settings = config.load("gpu.toml", {**size, "episode_length": str(length)})
@@ -66,10 +66,10 @@ def bare(envs: int, steps: int = 20) -> dict[str, float | str]:
     """Physics steps per second of `vmap(mjx.step)` by each of MJX's back ends that is installed."""
     import jax
 
-    from arm5dof import arm
-    from arm5dof.mjx import mjx
+    from arm5dof.arm import load_arm
+    from arm5dof.runtime.mjx import mjx
 
-    loaded = arm.load("reach.xml")
+    loaded = load_arm("reach.xml")
     q = loaded.sample(jax.random.key(0), (envs,))
     place = lambda q, d: d.replace(qpos=d.qpos.at[loaded.qpos].set(q))
     found: dict[str, float | str] = {}
@@ -109,13 +109,13 @@ def main() -> None:
     text = markdown(columns)
     print(text)
     if arguments.envs == ENVS and arguments.episode_length == 160:
-        from arm5dof import files
+        from arm5dof.runtime import files
 
         files.write_text(RESULTS / "gpu.md", text)
 
 
 def markdown(columns: dict[int, dict[str, float | str]]) -> str:
-    from arm5dof import run
+    from arm5dof.training import run
 
     show = lambda value: value if isinstance(value, str) else f"{value:,.4g}" if value < 1e4 else f"{value:,.0f}"
     lines = [

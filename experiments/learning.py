@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arm5dof import config, files, run, xla
+from arm5dof.runtime import files, xla
+from arm5dof.training import config, run
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -40,10 +40,10 @@ def seconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
 
 
 def reach(dynamics: str = "servo"):
-    from arm5dof import arm
+    from arm5dof.arm import load_arm
     from arm5dof.envs import Reach, ReachConfig
 
-    return Reach(arm.load("reach.xml"), ReachConfig(dynamics=dynamics))
+    return Reach(load_arm("reach.xml"), ReachConfig(dynamics=dynamics))
 
 
 def env(batch: int = 1024, steps: int = 20) -> dict[str, float]:
@@ -52,8 +52,8 @@ def env(batch: int = 1024, steps: int = 20) -> dict[str, float]:
     import jax
 
     from arm5dof.envs import VectorEnv
-    from arm5dof.mjx import mjx
-    from arm5dof.physics import FIELDS
+    from arm5dof.envs.physics import FIELDS
+    from arm5dof.runtime.mjx import mjx
 
     task = reach()
     substeps, model = task.config.substeps, task.arm.mjx_model
@@ -80,7 +80,7 @@ def flag(batch: int = 1024, steps: int = 50) -> dict[str, float]:
     """Steps per second of bare `vmap(mjx.step)` in this process, whatever XLA_FLAGS says."""
     import jax
 
-    from arm5dof.mjx import mjx
+    from arm5dof.runtime.mjx import mjx
 
     model = reach().arm.mjx_model
     start = jax.jit(jax.vmap(lambda ctrl: mjx.make_data(model).replace(ctrl=ctrl)))
@@ -95,8 +95,8 @@ def update() -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
-    from arm5dof import xla
     from arm5dof.ddpg import DDPG, DDPGConfig
+    from arm5dof.runtime import xla
 
     config, count = DDPGConfig(), 512
     agent = DDPG(reach("kinematic"), config, num_envs=64, episode_length=160, total_steps=1000)
@@ -154,7 +154,8 @@ def profile() -> dict[str, float]:
     """What a training step of the default experiment consists of: 50 environments, 128 updates."""
     import jax
 
-    from arm5dof import config, run, xla
+    from arm5dof.runtime import xla
+    from arm5dof.training import config, run
 
     trainer = run.make_trainer(config.load("reach.toml"))
     agent, ddpg = trainer.agent, trainer.config.ddpg
@@ -215,7 +216,8 @@ def replay() -> dict[str, float]:
 
 def first_step() -> dict[str, float]:
     """Compile the default experiment's program and take one step of every environment, gradient steps included."""
-    from arm5dof import config, run, xla
+    from arm5dof.runtime import xla
+    from arm5dof.training import config, run
 
     xla.enable_compilation_cache()
     trainer = run.make_trainer(config.load("reach.toml", {"epoch_steps": "1"}))
@@ -228,7 +230,7 @@ def bare_step() -> dict[str, float]:
     """Compile one `vmap(mjx.step)` for as many environments and take it."""
     import jax
 
-    from arm5dof.mjx import mjx
+    from arm5dof.runtime.mjx import mjx
 
     arm = reach().arm
 
@@ -293,7 +295,7 @@ def main() -> None:
         "gradient step": alone("update")[0],
         "replay buffer": alone("replay")[0],
     }
-    from arm5dof import files
+    from arm5dof.runtime import files
 
     lines = [
         "# The machine's share",

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from arm5dof import files
-from arm5dof.arm import Arm, load
+from arm5dof.arm import Arm, load_arm
+from arm5dof.arm.kinematics import forward, inverse
 from arm5dof.envs import Reach, ReachConfig
-from arm5dof.kinematics import forward, inverse
+from arm5dof.runtime import files
 
 POSES, ENVS, STEPS = 1_000_000, 256, 160
 RESULTS = Path(__file__).parent / "results"
@@ -102,7 +102,7 @@ def servos(arm: Arm) -> dict[str, str]:
 
 
 def main() -> None:
-    arm = load("reach.xml")
+    arm = load_arm("reach.xml")
     found = closed_forms(arm) | physics(arm) | servos(arm)
     lines = ["# Precision", "", "Largest errors found. Command: `python experiments/precision.py`.", "", "| | |"]
     lines += ["| --- | ---: |", *(f"| {name} | {value} |" for name, value in found.items())]

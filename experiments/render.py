@@ -7,13 +7,13 @@ import cv2
 import mujoco
 import numpy as np
 
-from arm5dof import arm
+from arm5dof.arm import load_arm
 
 POSE = np.radians([18, 6, 75, -80, -52])
 
 
 def main(path: Path) -> None:
-    loaded = arm.load("reach.xml")
+    loaded = load_arm("reach.xml")
     model, data = loaded.mj_model, mujoco.MjData(loaded.mj_model)
     data.qpos[loaded.qpos] = POSE
     data.qpos[len(POSE) :] = 0.02

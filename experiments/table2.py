@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arm5dof import config, files, report, run, xla
+from arm5dof.runtime import files, xla
+from arm5dof.training import config, report, run
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -20,10 +20,10 @@ import cv2
 import jax
 import numpy as np
 
-from arm5dof import files
+from arm5dof.runtime import files
+from arm5dof.vision.detectors.yolo_onnx import OnnxYOLO
+from arm5dof.vision.detectors.yolov5.model import YOLOv5
 from arm5dof.vision.images import letterbox, read
-from arm5dof.vision.onnx import OnnxYOLO
-from arm5dof.vision.yolov5 import YOLOv5
 
 SIZES, TURNS = (640, 320), 40
 RESULTS = Path(__file__).parent / "results"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
-from arm5dof import xla
+from arm5dof.runtime import xla
 
 # JAX reads these settings when it is imported, so nothing above may import it, and the fixtures below import late.
 xla.enable_compilation_cache()
@@ -33,9 +33,9 @@ def test_data() -> Path:
 
 @pytest.fixture(scope="session")
 def arm() -> Arm:
-    from arm5dof.arm import load
+    from arm5dof.arm import load_arm
 
-    return load("reach.xml")
+    return load_arm("reach.xml")
 
 
 @pytest.fixture(scope="session")

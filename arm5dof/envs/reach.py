@@ -11,8 +11,8 @@ from annotated_types import Ge
 
 from arm5dof.arm import Arm
 from arm5dof.envs.base import Observation, State
+from arm5dof.envs.physics import Physics
 from arm5dof.errors import UserError
-from arm5dof.physics import Physics
 from arm5dof.settings import settings, static
 
 

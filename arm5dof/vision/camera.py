@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from arm5dof import files
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 Array = jax.Array | np.ndarray
 

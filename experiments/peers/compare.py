@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from peer import SETTINGS
 from task import BAR
 
-from arm5dof.report import BLUE, INK, ORANGE, STYLE
+from arm5dof.training.report import BLUE, INK, ORANGE, STYLE
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from task import Record
 
-from arm5dof import config, run, xla
+from arm5dof.runtime import xla
+from arm5dof.training import config, run
 
 
 def main() -> None:

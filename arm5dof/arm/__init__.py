@@ -1,0 +1,5 @@
+"""The arm: any serial arm in MJCF, its forward kinematics, and the paper's closed form."""
+
+from arm5dof.arm.arm import Arm, load_arm
+
+__all__ = ["Arm", "load_arm"]

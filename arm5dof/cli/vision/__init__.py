@@ -1,0 +1,1 @@
+"""`arm5dof vision ...`."""

@@ -1,0 +1,144 @@
+"""`arm5dof vision ...`: what the command line does with cameras. Declared here, imported by `arm5dof.cli`.
+
+Declaring must be quick, so everything that takes OpenCV or JAX is imported where it is used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arm5dof.cli.vision import detect as detect_command
+from arm5dof.cli.vision import doctor as doctor_command
+from arm5dof.cli.vision import eval as eval_command
+from arm5dof.cli.vision import hand_eye as hand_eye_command
+from arm5dof.cli.vision import locate as locate_command
+from arm5dof.cli.vision import options
+from arm5dof.cli.vision import pose as pose_command
+from arm5dof.cli.vision import train as train_command
+from arm5dof.runtime import files
+
+if TYPE_CHECKING:
+    from arm5dof.vision.calibration.intrinsics import Calibration, Views
+
+CALIBRATE_HELP = """\
+Calibrate a camera from photographs of a board.
+
+Print a checkerboard, glue it to something flat, measure a square with a ruler, and take 10 to 20 photographs with the
+camera at its working focus: the whole board in each, tilted by 30 to 45 degrees to all sides, near and far, in the
+middle and in the corners of the picture. Do not move zoom or focus between them.
+
+  arm5dof vision calibrate photos/ --board 9x6 --square 0.025 --out camera.yml
+  arm5dof vision calibrate *.jpg --board 9x6 --square 0.025 --out camera.yml --preview straight.png
+  arm5dof vision calibrate photos/ --board 8x6 --square 0.03 --charuco 0.022 --out camera.yml
+
+A checkerboard is counted in inner corners, where four squares meet: one of 10 x 7 squares has 9x6. A ChArUco board is
+counted in squares. The result goes into a YAML file in OpenCV's format. Judge it by the +- of the intrinsics rather
+than by the error in pixels: few photographs fit well and say little. Exit status 2, and nothing written, if the
+photographs are too few, show another board, or leave the intrinsics uncertain.
+"""
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Add the vision commands to the parser of `arm5dof vision`."""
+    parser.set_defaults(run=lambda known, rest: parser.print_help())
+    commands = parser.add_subparsers(metavar="COMMAND")
+    raw = argparse.RawDescriptionHelpFormatter
+
+    p = commands.add_parser(
+        "calibrate", help="calibrate a camera from photographs", description=CALIBRATE_HELP, formatter_class=raw
+    )
+    p.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="photographs, or folders of them")
+    options.add_board(p)
+    p.add_argument(
+        "--distortion",
+        type=int,
+        choices=(4, 5, 8),
+        default=5,
+        help="how many coefficients to estimate; default 5, 8 for wide lenses",
+    )
+    p.add_argument("--out", type=Path, required=True, metavar="CAMERA.yml", help="where the camera goes")
+    p.add_argument("--preview", type=Path, metavar="OUT.png", help="a photograph before and after undistortion")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=calibrate)
+
+    pose_command.declare(commands)
+    hand_eye_command.declare(commands)
+    detect_command.declare(commands)
+    locate_command.declare(commands)
+    train_command.declare(commands)
+    eval_command.declare(commands)
+    doctor_command.declare(commands)
+
+
+def calibrate(known: argparse.Namespace, rest: list[str]) -> None:
+    """`arm5dof vision calibrate`."""
+    options.nothing_left(rest, "calibrate")
+    options.writable(known.out, (".yml", ".yaml"))
+    if known.preview is not None:
+        options.writable(known.preview, (".png", ".jpg"))
+
+    from arm5dof.runtime.progress import late_bar
+    from arm5dof.vision.calibration import intrinsics as calibration
+    from arm5dof.vision.io.sources import image_files
+
+    paths = image_files(known.images)
+    board = options.board(known)
+    with late_bar("looking for the board", len(paths), "photographs") as progress:
+        views = calibration.find_views(paths, board, progress)
+    result = calibration.calibrate(views, known.distortion)
+    used = next(path for path, name in zip(paths, calibration.names(paths), strict=True) if name in result.errors)
+    notes = {
+        "nframes": len(result.errors),
+        "board": str(board),
+        "square_size": known.square,
+        "avg_reprojection_error": result.rms,
+        "intrinsics_standard_deviations": result.deviations.reshape(-1, 1),
+    }
+    # Both files or none: the preview takes its place when the camera has been written.
+    with ExitStack() as stack:
+        if known.preview is not None:
+            encoded = calibration.preview(used, result.camera, known.preview.suffix)
+            stack.enter_context(files.replacing(known.preview)).write_bytes(encoded)
+        result.camera.save(known.out, notes)
+    print(json.dumps(as_json(views, result)) if known.json else table(views, result) + f"\ncamera: {known.out}")
+
+
+def table(views: Views, result: Calibration) -> str:
+    """What a calibration found, for people."""
+    from arm5dof.vision.calibration.intrinsics import INTRINSICS
+
+    width = max(len(name) for name in [*result.errors, *result.outliers, *views.without, "photograph"])
+    lines = [f"{'photograph':{width}}  error, pixels"]
+    lines += [f"{name:{width}}  {error:.3f}" for name, error in result.errors.items()]
+    lines += [
+        f"{name:{width}}  {error:.3f}  left out: does not fit the others" for name, error in result.outliers.items()
+    ]
+    lines += [f"{name:{width}}  -      left out: board not found" for name in views.without]
+    lines += ["", f"{'intrinsic':{width}}  value +- standard deviation"]
+    for name, value, deviation in zip(INTRINSICS, result.intrinsics, result.deviations, strict=False):
+        digits, unit = (2, " pixels") if name[0] in "fc" else (5, "")
+        lines.append(f"{name:{width}}  {value:.{digits}f} +- {deviation:.{digits}f}{unit}")
+    size = f"{result.camera.width}x{result.camera.height}"
+    return "\n".join([*lines, "", f"{len(result.errors)} photographs of {size}, error {result.rms:.3f} pixels RMS"])
+
+
+def as_json(views: Views, result: Calibration) -> dict[str, Any]:
+    """The same for programs."""
+    from arm5dof.vision.calibration.intrinsics import INTRINSICS
+
+    both = zip(result.intrinsics, result.deviations, strict=True)
+    return {
+        "image_size": [result.camera.width, result.camera.height],
+        "rms_px": result.rms,
+        "intrinsics": {
+            name: {"value": float(value), "deviation": float(deviation)}
+            for name, (value, deviation) in zip(INTRINSICS, both, strict=False)
+        },
+        "errors_px": result.errors,
+        "outliers_px": result.outliers,
+        "without_board": views.without,
+    }

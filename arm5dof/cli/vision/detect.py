@@ -1,0 +1,81 @@
+"""`arm5dof vision detect`. Everything that takes OpenCV or JAX is imported where it is used."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
+
+from arm5dof.cli.vision import detecting, options
+
+if TYPE_CHECKING:
+    from arm5dof.vision.io.sinks import Write
+    from arm5dof.vision.io.sources import Source
+
+HELP = """\
+Find objects of named classes in images.
+
+SOURCE is a photograph, several, folders of them, a video, or a camera by its number: 0 is the first; or simulated, for
+random scenes such as the shipped detector was trained for, simulated:20 for 20 of them.
+
+The shipped detector finds the things of our catalogue on a table. MODEL is a file with another:
+
+  .pt     YOLOv5's own weights (n, s, m, l, x, release 6 and later), or what was trained from them with that code; run
+          in JAX. The file is read without PyTorch, and nothing that it says is run.
+  .onnx   YOLOv5, v7, v8, v11 or YOLOX exported as ONNX, without suppression; run by OpenCV.
+  .npz    weights of our detector, as arm5dof vision train writes them.
+
+  arm5dof vision detect simulated --out found
+  arm5dof vision detect bus.jpg --detector yolov5n.pt
+  arm5dof vision detect photos/ --detector best.onnx --names classes.txt --out found
+  arm5dof vision detect clip.mp4 --detector yolov5n.pt --classes person,bus --out found
+  arm5dof vision detect 0 --detector yolov5n.pt --size 320 --out found       until Ctrl-C
+
+Without --out a table is printed. With it a new folder gets the images, or the video as MP4, with the boxes drawn in,
+and detections.json: a list with an object for each frame, {"name", "time_s", "image_size", "detections"}, and in that
+for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
+
+Faster: a smaller --size. Too little is found: --careful, or a lower --confidence; too much: a higher one. One thing is
+found twice: a lower --iou.
+
+If an image is damaged, a video breaks off or you press Ctrl-C, the frames before are written and the files are whole;
+the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so there the exit status is 0.
+"""
+
+
+def declare(commands: argparse._SubParsersAction) -> None:
+    """Add `detect` to the vision commands."""
+    raw = argparse.RawDescriptionHelpFormatter
+    p = commands.add_parser("detect", help="find objects in images", description=HELP, formatter_class=raw)
+    p.add_argument("source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, or simulated")
+    detecting.add_options(p)
+    p.add_argument("--json", action="store_true", help="print what goes into detections.json, frame by frame")
+    p.set_defaults(run=run)
+
+
+def run(known: argparse.Namespace, rest: list[str]) -> int:
+    """`arm5dof vision detect`."""
+    options.nothing_left(rest, "detect")
+
+    from arm5dof.vision.io.sources import open_source
+
+    source = open_source(known.source)
+    return detecting.run(known, source, _outputs(known, source))
+
+
+@contextmanager
+def _outputs(known: argparse.Namespace, source: Source) -> Iterator[list[Write]]:
+    """What the command line asks for."""
+    from arm5dof.vision.io import sinks as outputs
+
+    with ExitStack() as stack:
+        asked = []
+        if known.out is not None:
+            asked.append(stack.enter_context(outputs.folder(known.out, source)))
+        if known.json:
+            asked.append(stack.enter_context(outputs.json_list(sys.stdout)))
+        elif known.out is None:
+            asked.append(stack.enter_context(outputs.table(sys.stdout)))
+        yield asked

@@ -1,0 +1,118 @@
+"""Detection as a command does it: its options, frame after frame with a progress bar, and Ctrl-C. Everything that takes
+OpenCV or JAX is imported where it is used."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arm5dof.errors import UserError
+
+if TYPE_CHECKING:
+    from arm5dof.vision.io.sinks import Write
+    from arm5dof.vision.io.sources import Source
+
+
+def add_options(p: argparse.ArgumentParser) -> None:
+    """Which detector, what it is to find, and where that goes."""
+    p.add_argument("--detector", type=Path, metavar="MODEL", help="a .pt, .onnx or .npz file; default: what ships")
+    p.add_argument("--names", type=Path, metavar="FILE", help="names of the classes, one a line; default: the model's")
+    p.add_argument("--classes", type=_list, metavar="A,B,...", help="what to look for; default: every class")
+    p.add_argument("--confidence", type=float, default=0.25, metavar="P", help="how sure to be, 0 to 1; default 0.25")
+    p.add_argument(
+        "--iou", type=float, default=0.45, metavar="P", help="overlap at which boxes of a class are one; default 0.45"
+    )
+    p.add_argument(
+        "--size", type=int, metavar="PIXELS", help="side of the network's input; default: the model's, or 640"
+    )
+    p.add_argument("--careful", action="store_true", help="the shipped detector looks three times, in twice the time")
+    p.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder for what was found")
+
+
+def given(known: argparse.Namespace) -> list[str]:
+    """Which of these options are not as they are by default."""
+    p = argparse.ArgumentParser(add_help=False)
+    add_options(p)
+    return [f"--{name}" for name, default in vars(p.parse_args([])).items() if getattr(known, name) != default]
+
+
+def run(known: argparse.Namespace, source: Source, outputs: AbstractContextManager[list[Write]]) -> int:
+    """Detect in all frames as the options say and hand each on to the outputs; gives the exit status. Raises
+    `UserError` where it cannot go on; what came before is kept."""
+    if known.out is not None and known.out.exists():
+        raise UserError(f"{known.out} exists: choose another --out")
+
+    import numpy as np
+
+    from arm5dof.runtime.progress import Bar
+    from arm5dof.vision.detectors.loading import detect, load, read_names
+
+    names = None if known.names is None else read_names(known.names)
+    failure, seen, done, started = None, Counter[str](), 0, time.monotonic()
+    with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
+        bar.update(0, "reading the detector")
+        detector = load(known.detector, names, known.confidence, known.iou, known.size, known.careful)
+        results = detect(source.frames, detector, known.classes)
+        bar.update(0, "starting")
+        if source.live:  # A camera shall not wait while the program for the first image is compiled.
+            detector(np.zeros((480, 640, 3), np.uint8))
+        with outputs as writers, interruptible() as interrupts:
+            try:
+                for frame, found in results:
+                    for write in writers:
+                        write(frame, found)
+                    done += 1
+                    here = Counter(found.data["class_name"].tolist())
+                    seen += here
+                    bar.update(done, _counted(here))
+                    if interrupts:
+                        break
+            except UserError as error:
+                if not done:
+                    raise
+                failure = error
+    frames = "1 frame" if done == 1 else f"{done} frames"
+    kept = f"{frames} before that {'printed' if known.out is None else f'in {known.out}'}"
+    if failure is not None:
+        raise UserError(f"{failure}; {kept}")
+    if interrupts and not source.live:
+        print(f"arm5dof: interrupted; {kept}", file=sys.stderr)
+        return 130
+    if not known.json:
+        print(f"{frames} in {time.monotonic() - started:.1f} s: {_counted(seen)}")
+        if known.out is not None:
+            print(f"written: {known.out}")
+    return 0
+
+
+@contextmanager
+def interruptible() -> Iterator[list[int]]:
+    """Ctrl-C fills the list, so that the frame at hand can be finished; a second one interrupts at once."""
+    interrupts: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, _: object) -> None:
+        interrupts.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    if before is signal.default_int_handler:  # It is another where Ctrl-C is to be ignored, as in the background.
+        signal.signal(signal.SIGINT, ask)
+    try:
+        yield interrupts
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _counted(classes: Counter[str]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in classes.most_common()) or "nothing"
+
+
+def _list(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]

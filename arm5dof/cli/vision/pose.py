@@ -1,0 +1,125 @@
+"""`arm5dof vision pose`. Everything that takes OpenCV or JAX is imported where it is used."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arm5dof.cli.vision import options
+from arm5dof.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from arm5dof.vision.camera import Camera
+
+HELP = """\
+Find where a camera stands, from one photograph of a board whose place is known.
+
+Calibrate the camera first. Lay the board on the table, printed side up, where the arm will work, and measure from the
+arm's base to the board's first corner and along its rows:
+
+  arm5dof vision pose camera.yml board.jpg --board 9x6 --square 0.025 --at 0.20 0.10 0 -90 --out posed.yml
+
+--at X Y Z TURN: the first inner corner lies at X Y Z, metres in the base frame, and the rows of corners run in the
+direction TURN, degrees from the base's x axis towards its y axis. Seen so that rows run from left to right, the first
+corner is the top left one, and the board's own corner beside it is black; on a ChArUco board it is the one that
+OpenCV counts as 0. Only a board with an odd and an even number of corners tells its first corner.
+
+--at X Y Z QW QX QY QZ: a board that does not lie flat, by the pose of its frame: x along the rows of corners, y down
+the columns, z into the board.
+
+The pose goes into a new file beside the intrinsics, with the covariance of both.
+"""
+
+
+def declare(commands: argparse._SubParsersAction) -> None:
+    """Add `pose` to the vision commands."""
+    raw = argparse.RawDescriptionHelpFormatter
+    p = commands.add_parser("pose", help="find where a camera stands", description=HELP, formatter_class=raw)
+    p.add_argument("camera", type=Path, metavar="CAMERA.yml", help="the calibrated camera")
+    p.add_argument("image", type=Path, metavar="IMAGE", help="a photograph of the board")
+    options.add_board(p)
+    p.add_argument("--at", type=float, nargs="+", required=True, metavar="N", help="X Y Z TURN, or X Y Z QW QX QY QZ")
+    p.add_argument(
+        "--placed",
+        type=float,
+        nargs=2,
+        default=(5e-4, 0.1),
+        metavar=("METRES", "DEGREES"),
+        help="how well that was measured, as standard deviations; default 0.0005 0.1",
+    )
+    p.add_argument("--out", type=Path, required=True, metavar="OUT.yml", help="where the camera with its pose goes")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=run)
+
+
+def run(known: argparse.Namespace, rest: list[str]) -> None:
+    """`arm5dof vision pose`."""
+    options.nothing_left(rest, "pose")
+    options.writable(known.out, (".yml", ".yaml"))
+    board_to_base, placed = _at(known.at), _placed(known.placed)
+
+    from arm5dof.vision.calibration.extrinsics import from_board
+    from arm5dof.vision.camera import Camera
+
+    board = options.board(known)
+    camera = from_board(Camera.load(known.camera), known.image, board, board_to_base, placed)
+    camera.save(known.out, {"board": str(board), "square_size": known.square})
+    print(json.dumps(as_json(camera)) if known.json else f"{table(camera)}\ncamera: {known.out}")
+
+
+def as_json(camera: Camera) -> dict[str, Any]:
+    """Where a camera stands, for programs: its position in metres, its rotation as a matrix, and standard deviations of
+    a turn about its own axes (degrees) and a shift along them (metres), null if unknown."""
+    import numpy as np
+
+    deviations = None
+    if camera.covariance is not None:
+        turn, shift = np.split(np.sqrt(np.diag(np.asarray(camera.covariance))[-6:]), 2)
+        deviations = {"turn_deg": np.rad2deg(turn).tolist(), "shift_m": shift.tolist()}
+    position, rotation = np.asarray(camera.position), np.asarray(camera.rotation)
+    return {"position_m": position.tolist(), "rotation": rotation.tolist(), "deviations": deviations}
+
+
+def table(camera: Camera, frame: str = "base") -> str:
+    """The same for people."""
+    said = as_json(camera)
+
+    def spread(name: str, factor: float, unit: str) -> str:
+        if said["deviations"] is None:
+            return ""
+        return "  +- " + " ".join(f"{factor * v:.2f}" for v in said["deviations"][name]) + f" {unit}"
+
+    position = " ".join(f"{1e3 * v:.1f}" for v in said["position_m"])
+    looks = " ".join(f"{row[2]:.4f}" for row in said["rotation"])
+    width = max(len(position) + 3, len(looks))
+    lines = [
+        f"the camera in the {frame} frame, +- standard deviations along and about the camera's own axes",
+        f"stands at  {f'{position} mm':{width}}{spread('shift_m', 1e3, 'mm')}",
+        f"looks to   {looks:{width}}{spread('turn_deg', 1, 'degrees')}",
+    ]
+    if said["deviations"] is None:
+        lines.append("how well is unknown: the camera file has no covariance; vision calibrate writes one")
+    return "\n".join(lines)
+
+
+def _at(numbers: list[float]) -> np.ndarray:
+    """The board's pose (4, 4)."""
+    if len(numbers) not in (4, 7) or not all(map(math.isfinite, numbers)):
+        raise UserError("--at takes X Y Z TURN (metres, degrees) or X Y Z QW QX QY QZ")
+    if len(numbers) == 7:
+        return options.pose(numbers)
+    half = math.radians(numbers[3]) / 2
+    # The rows turn about the base's z axis; then the board turns over, its z axis being that into the table.
+    return options.pose([*numbers[:3], 0.0, math.cos(half), math.sin(half), 0.0])
+
+
+def _placed(given: tuple[float, float]) -> tuple[float, float]:
+    metres, degrees = given
+    if not (0 <= metres < 1 and 0 <= degrees < 90):
+        raise UserError("--placed takes standard deviations: METRES and DEGREES, such as 0.001 0.2")
+    return metres, math.radians(degrees)

@@ -1,0 +1,71 @@
+"""Files: the ones shipped with the package, and writing that never leaves half of one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from arm5dof.errors import UserError
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def find(folder: str, name: str | Path) -> Path | None:
+    """A file the user named, or one of that name in a shipped folder (`mjcf`, `experiments`); None if neither is.
+
+    An installed wheel carries those folders inside the package, a checkout beside it.
+    """
+    candidates = [Path(name), PACKAGE / folder / name, PACKAGE.parent / folder / name]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def shipped(folder: str, suffix: str) -> list[str]:
+    """Names of the files that ship in a folder, for error messages and help."""
+    roots = (PACKAGE / folder, PACKAGE.parent / folder)
+    return sorted({path.name for root in roots if root.is_dir() for path in root.glob(f"*{suffix}")})
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path` that takes its place when the block succeeds and vanishes when it fails."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def making(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder` that takes its name when the block succeeds and vanishes when it fails. Raises
+    `UserError` if `folder` exists."""
+    if folder.exists():
+        raise UserError(f"{folder} exists: choose another name")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o777 & ~_umask())
+        temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

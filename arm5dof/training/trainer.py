@@ -1,0 +1,193 @@
+"""The host's side of training: epochs on the device, and between them metrics, evaluations and checkpoints."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
+from typing import Annotated, Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import psutil
+from annotated_types import Ge
+
+from arm5dof.ddpg import DDPG, DDPGConfig, Training
+from arm5dof.envs import Reach
+from arm5dof.errors import UserError
+from arm5dof.runtime import xla
+from arm5dof.runtime.programs import Program
+from arm5dof.settings import settings, static
+from arm5dof.training.policy import Policy
+
+Count = Annotated[int, Ge(1)]
+PROBES = 500
+
+
+@settings
+class TrainConfig:
+    """The budget."""
+
+    seed: Annotated[int, Ge(0)] = static(default=0)
+    """Of all random numbers: same seed and machine, same bits."""
+    episodes: Count = static(default=400)
+    """Episodes in all; a multiple of the number of environments."""
+    num_envs: Count = static(default=50)
+    """Environments that run side by side."""
+    epoch_steps: Count = static(default=16)
+    """Steps of every environment in one device call; divides the episode's length. Metrics have this grain."""
+    evaluate_every: Count = static(default=100)
+    """Episodes between evaluations; a multiple of the number of environments."""
+    checkpoint_every: Count = static(default=50)
+    """Episodes between checkpoints; a multiple of the number of environments."""
+
+
+class Settings(Protocol):
+    """The parts of a configuration that a training needs."""
+
+    @property
+    def ddpg(self) -> DDPGConfig: ...
+
+    @property
+    def train(self) -> TrainConfig: ...
+
+
+class Trainer:
+    """A compiled training program for one environment and configuration.
+
+    `state` is the whole run, made by `start` or restored from a checkpoint; `advance` takes it one epoch further.
+    Raises `UserError` if the budget does not divide.
+    """
+
+    state: Training
+
+    def __init__(self, env: Reach, config: Settings) -> None:
+        budget, length = config.train, env.config.episode_length
+        for name in ("episodes", "evaluate_every", "checkpoint_every"):
+            if getattr(budget, name) % budget.num_envs:
+                raise UserError(
+                    f"{name} = {getattr(budget, name)} is no multiple of num_envs = {budget.num_envs}: environments "
+                    f"finish their episodes together"
+                )
+        if length % budget.epoch_steps:
+            raise UserError(f"epoch_steps = {budget.epoch_steps} does not divide episode_length = {length}")
+        self.env = env
+        self.config = config
+        self.total_steps = budget.episodes // budget.num_envs * length
+        self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
+        self._init = jax.jit(self.agent.init, compiler_options=xla.effort(0))
+
+    @property
+    def replay_bytes(self) -> int:
+        """Memory that the replay buffer takes on the device."""
+        return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.like.replay))
+
+    @cached_property
+    def like(self) -> Training:
+        """Shapes and types of the state."""
+        return self._init.eval_shape(self.config.ddpg, jax.random.key(0))
+
+    def check(self) -> None:
+        """Raises `UserError` if the replay buffer cannot fit into the device's memory, or the arm has something that
+        its dynamics cannot simulate."""
+        needed, free = self.replay_bytes, memory_free()
+        if needed > free:
+            raise UserError(
+                f"replay_capacity = {self.config.ddpg.replay_capacity} takes {needed / 1e9:.1f} GB and "
+                f"{free / 1e9:.1f} GB are free: choose a smaller one"
+            )
+        if self._program.kept is None:  # Else it has been simulated before.
+            self.env.check()
+
+    def start(self) -> None:
+        """Begin a new run."""
+        with xla.uncollected():
+            self.check()
+            epoch = self._epoch  # Everything else is compiled while this is.
+            state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
+            # Bound to its device, as epochs return it: the policy would be compiled once for either.
+            self.state = jax.tree.map(lambda x: jax.device_put(x, x.sharding), state)
+            self._policy_distance()
+            epoch.result()
+
+    def advance(self) -> dict[str, float]:
+        """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and the
+        mean distance in metres by which one answer of the policy, without noise, misses a few hundred targets."""
+        leaves, metrics = self._epoch.result()(*self._leaves(self.state))
+        self.state = jax.tree.unflatten(jax.tree.structure(self.like), leaves)
+        metrics["policy_distance"] = self._policy_distance()
+        return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+    @cached_property
+    def _program(self) -> Program:
+        """An epoch, from and to the leaves of the state."""
+        config, state = jax.tree.structure(self.config.ddpg), jax.tree.structure(self.like)
+        steps = self.config.train.epoch_steps
+
+        def epoch(numbers: list[float], leaves: list[jax.Array]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+            training = jax.tree.unflatten(state, leaves)
+            training, metrics = self.agent.epoch(jax.tree.unflatten(config, numbers), training, steps)
+            return jax.tree.leaves(training), metrics
+
+        known = self.env.identity
+        identity = None if known is None else (*known, config, self.total_steps, steps)
+        return Program(epoch, self._leaves(self.like), identity)
+
+    def _leaves(self, state: Training) -> tuple[list[float], list[jax.Array]]:
+        return jax.tree.leaves(self.config.ddpg), jax.tree.leaves(state)
+
+    @cached_property
+    def _epoch(self) -> Future[jax.stages.Compiled]:
+        """Compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
+        epoch = self._program.jit(donate_argnums=1, compiler_options=xla.effort(2))
+        return ThreadPoolExecutor(1).submit(epoch.lower(*self._leaves(self.like)).compile)
+
+    def _policy_distance(self) -> jax.Array:
+        policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)
+        return policy(self._probes).error.mean()
+
+    @cached_property
+    def _probes(self) -> jax.Array:
+        """Targets for watching the policy, from random numbers that neither training nor evaluation uses."""
+
+        def sample(key: jax.Array) -> jax.Array:
+            return jax.vmap(self.env.sample_goal)(jax.random.split(jax.random.fold_in(key, 0x9B0E), PROBES))
+
+        return jax.jit(sample, compiler_options=xla.effort(0))(jax.random.key(self.config.train.seed))
+
+    @property
+    def counters(self) -> Counters:
+        """How far the run is."""
+        steps = int(self.state.steps)
+        env_steps = steps * self.config.train.num_envs
+        return Counters(steps, env_steps // self.env.config.episode_length, env_steps, int(self.state.updates))
+
+    @property
+    def finished(self) -> bool:
+        return self.counters.steps >= self.total_steps
+
+    def policy(self) -> Policy:
+        """The policy as it is now. Its networks are copies: the next epoch reuses the originals' memory."""
+        networks = jax.tree.map(jnp.copy, self.state.networks)
+        return Policy(self.env, self.agent, self.config.ddpg, networks)
+
+
+def memory_free() -> int:
+    """Bytes that the device's memory has left."""
+    found = jax.devices()[0].memory_stats()
+    if found and "bytes_limit" in found:
+        return found["bytes_limit"] - found["bytes_in_use"]
+    return psutil.virtual_memory().available
+
+
+class Counters(NamedTuple):
+    """Steps of each environment, episodes, steps of all environments together, and updates."""
+
+    steps: int
+    episodes: int
+    env_steps: int
+    updates: int
+
+
+def row(counters: Counters, seconds: float, metrics: dict[str, Any]) -> dict[str, Any]:
+    """One line of `metrics.csv`."""
+    return {**counters._asdict(), "seconds": round(seconds, 2), **metrics}

@@ -1,0 +1,94 @@
+"""How well a camera is known: the covariance of what calibration estimates, in the order of `Camera.disturbed`.
+
+Standard deviations alone will not do. Errors of the focal length, the distortion and the pose hang together, and most
+of what they do to a pixel cancels; taken one by one they would make a camera look several times worse than it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+
+from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.camera import Camera
+
+
+def with_intrinsics(camera: Camera, views: Sequence[Corners], boards: Sequence[np.ndarray]) -> Camera:
+    """The camera that was calibrated from these views, with the covariance of its intrinsics. `boards` are the boards'
+    poses in the camera's frame (4, 4), estimated together with them."""
+    size = 4 + len(camera.distortion)
+    information, squares, spare = np.zeros((size, size)), 0.0, -size
+    for corners, board in zip(views, boards, strict=True):
+        residual, jacobian = linearise(camera, corners, board)
+        lens, pose = np.split(jacobian, [size], axis=1)
+        # What of an error in the intrinsics the board's pose cannot make good.
+        left = lens - pose @ np.linalg.lstsq(pose, lens, rcond=None)[0]
+        information += left.T @ left
+        squares += residual @ residual
+        spare += len(residual) - 6
+    covariance = np.zeros((size + 6, size + 6))
+    covariance[:size, :size] = np.linalg.inv(information) * squares / spare
+    return camera.replace(covariance=covariance)
+
+
+def with_pose(camera: Camera, solve: Callable[[Camera], np.ndarray], noise: np.ndarray) -> Camera:
+    """The camera with the pose (4, 4) that `solve` finds for it, and the covariance of both. `noise` is the pose's
+    covariance (6, 6), a turn and a shift in the camera's own frame, were the intrinsics exact: what their errors do to
+    the pose is found by solving again."""
+    pose = solve(camera)
+    posed = camera.with_pose(pose[:3, :3], pose[:3, 3])
+    if camera.covariance is None:
+        return posed
+    lens = np.asarray(camera.covariance, float)[:-6, :-6]
+    follows = np.zeros((6, len(lens)))
+    for i, deviation in enumerate(np.sqrt(np.diag(lens))):
+        if deviation:
+            error = np.zeros(len(lens) + 6)
+            error[i] = deviation
+            more, less = (_step(pose, solve(camera.disturbed(sign * error))) for sign in (1, -1))
+            follows[:, i] = (more - less) / (2 * deviation)
+    both = lens @ follows.T
+    return posed.replace(covariance=np.block([[lens, both], [both.T, follows @ both + noise]]))
+
+
+def board_noise(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndarray:
+    """Covariance (6, 6) of the camera's pose beside a board, a turn and a shift in its own frame, by what separates the
+    corners from where they should be seen."""
+    residual, jacobian = linearise(camera, corners, board)
+    by_pose = jacobian[:, -6:]
+    return np.linalg.inv(by_pose.T @ by_pose) * (residual @ residual) / (len(residual) - 6)
+
+
+def carried(placed: tuple[float, float], board: np.ndarray) -> np.ndarray:
+    """What it does to the camera's pose (6, 6) that a board, at the pose `board` (4, 4) in its frame, is `placed` only
+    so well: standard deviations of its place (metres) and its turn (radians), along and about each axis."""
+    turn = board[:3, :3]
+    x, y, z = board[:3, 3]
+    lever = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # The turn of a board at its place moves a camera that sees it there.
+    carry = np.block([[turn, np.zeros((3, 3))], [lever @ turn, turn]])
+    return carry @ np.diag(np.repeat(np.square(placed[::-1]), 3)) @ carry.T
+
+
+def linearise(camera: Camera, corners: Corners, board: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What separates the corners of a board at the pose `board` (4, 4) in the camera's frame from where they were seen,
+    (2n,) pixels, and its derivative by the errors that `Camera.disturbed` takes, (2n, m)."""
+    turn, _ = cv2.Rodrigues(board[:3, :3])
+    lens = np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
+    pixels, jacobian = cv2.projectPoints(corners.points, turn, board[:3, 3], *lens)
+    by_point = jacobian[:, 3:6].reshape(-1, 2, 3)
+    x, y, z = (corners.points @ board[:3, :3].T + board[:3, 3]).T
+    o = np.zeros_like(x)
+    cross = np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
+    # When the camera turns and shifts, what it sees does the opposite.
+    by_pose = np.concatenate([by_point @ cross, -by_point], axis=2).reshape(-1, 6)
+    residual = (pixels[:, 0] - corners.pixels).ravel()
+    return residual, np.concatenate([jacobian[:, 6 : 10 + len(lens[1])], by_pose], axis=1)
+
+
+def _step(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The small turn and shift (6,) that lead from one pose to another, in the frame of the first."""
+    move = np.linalg.inv(start) @ end
+    return np.concatenate([cv2.Rodrigues(move[:3, :3])[0].ravel(), move[:3, 3]])

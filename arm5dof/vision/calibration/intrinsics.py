@@ -1,0 +1,274 @@
+"""Calibration of a camera from photographs of a board.
+
+A small reprojection error alone proves nothing: a single photograph fits better than thirteen do, with a focal length
+that is wrong by half. So a calibration is judged by the standard deviations of what it estimated, and by how many
+different views it rests on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from arm5dof.errors import UserError
+from arm5dof.vision import images
+from arm5dof.vision.calibration import covariance as uncertainty
+from arm5dof.vision.calibration.boards import Board, Corners
+from arm5dof.vision.camera import Camera
+
+MIN_VIEWS = 5
+"""Different views that a calibration takes. OpenCV's 13 photographs give the focal length to 0.1 % from any five of
+them, and to between 0.1 and 2 % from two or three."""
+
+SAME_VIEW = 0.02
+"""Views whose corners are closer than this share of the picture's diagonal, on average, are one view."""
+
+MAX_DEVIATION = 0.005
+"""The largest standard deviation of a focal length that is accepted, as a share of it; and of the principal point, as
+a share of the picture's larger side."""
+
+OUTLIER = 3.0
+"""A view whose error under the others' calibration is so many times their median is not of the same camera, or has
+wrong corners."""
+
+DISAGREEMENT = 2.5
+"""The error of all views together may be so many times what each leaves with intrinsics of its own: 1.2 times for
+OpenCV's photographs, four times where half of them are of another camera and so none stands out."""
+
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""What is estimated, in OpenCV's order: pixels, then distortion coefficients without a unit."""
+
+COUNT_FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
+"""OpenCV's flags for so many distortion coefficients."""
+
+
+class View(NamedTuple):
+    """A board in a photograph."""
+
+    name: str
+    corners: Corners
+
+
+class Views(NamedTuple):
+    """What was found in a set of photographs."""
+
+    found: list[View]
+    without: list[str]
+    """Names of the photographs in which the board was not found."""
+    size: tuple[int, int]
+    """Width and height of every photograph."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera without a pose, and how well it is known."""
+
+    camera: Camera
+    rms: float
+    """Root mean square of the reprojection error, pixels."""
+    deviations: np.ndarray
+    """Standard deviations of the intrinsics named by `INTRINSICS`, (4 + coefficients,)."""
+    errors: dict[str, float]
+    """Root mean square reprojection error of every view used, pixels."""
+    outliers: dict[str, float]
+    """The same for the views left out, under the calibration of the others."""
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """The values that `deviations` belong to."""
+        matrix = np.asarray(self.camera.matrix)
+        return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.asarray(self.camera.distortion)])
+
+
+def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str], None] = lambda *_: None) -> Views:
+    """Look for the board in photographs. `progress` is told how many are done. Raises `UserError` if photographs
+    cannot be read or differ in size, if too few show the board, or if they show a larger one."""
+    sizes: dict[str, tuple[int, int]] = {}
+    found, without, notes = [], [], []
+    for i, (path, name) in enumerate(zip(paths, names(paths), strict=True)):
+        grey = read_grey(path)
+        sizes[name] = grey.shape[1], grey.shape[0]
+        corners = board.find(grey)
+        notes.append(board.inspect(grey, corners))
+        if corners is None:
+            without.append(name)
+        else:
+            found.append(View(name, corners))
+        progress(i + 1, name)
+    size = _one_size(sizes)
+    mismatch = board.mismatch(notes)
+    if mismatch is not None:
+        raise UserError(f"{len(found)} of {len(paths)} photographs show the {board}; {mismatch}")
+    if len(found) < MIN_VIEWS:
+        hint = "; in the others it is not seen whole, with a white margin and in focus" if without else ""
+        raise UserError(
+            f"{len(found)} of {len(paths)} photographs show the {board} and a calibration takes {MIN_VIEWS}, from "
+            f"different sides, tilted, near and far{hint}"
+        )
+    return Views(found, without, size)
+
+
+def calibrate(views: Views, coefficients: int = 5) -> Calibration:
+    """Calibrate, leaving out views that do not fit the others. Raises `UserError` if the views are too few, too much
+    alike or too contradictory to tell the camera's intrinsics."""
+    kept, outliers = list(views.found), []
+    result = fit(kept, views.size, coefficients)
+    while len(kept) > MIN_VIEWS:
+        worst = max(kept, key=lambda view: result.errors[view.name])
+        rest = [view for view in kept if view is not worst]
+        without = fit(rest, views.size, coefficients)
+        if board_error(without.camera, worst.corners) <= OUTLIER * float(np.median(list(without.errors.values()))):
+            break
+        kept, result = rest, without
+        outliers.append(worst)
+    if 4 * len(outliers) > len(views.found):
+        listed = ", ".join(view.name for view in outliers)
+        raise UserError(
+            f"{len(outliers)} of {len(views.found)} views do not fit the others ({listed}): use "
+            "one camera, one zoom and focus, one resolution, and a board that is flat"
+        )
+    _check_different(kept, views.size)
+    _check_agreement(kept, result)
+    _check_deviations(result)
+    seen = [view.corners for view in kept]
+    camera = uncertainty.with_intrinsics(result.camera, seen, [board_pose(result.camera, corners) for corners in seen])
+    return replace(result, camera=camera, outliers={view.name: board_error(camera, view.corners) for view in outliers})
+
+
+def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, flags: int = 0) -> Calibration:
+    """OpenCV's calibration of these views as they are, whatever they are worth. `flags` are OpenCV's."""
+    start = np.eye(3) if flags & cv2.CALIB_FIX_ASPECT_RATIO else None  # The ratio that is to be kept.
+    rms, matrix, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(  # type: ignore[call-overload]
+        [view.corners.points for view in views],
+        [view.corners.pixels for view in views],
+        size,
+        start,
+        None,
+        flags=flags | COUNT_FLAGS[coefficients],
+    )
+    return Calibration(
+        Camera(matrix, distortion.ravel()[:coefficients], np.eye(3), np.zeros(3), *size, posed=False),
+        float(rms),
+        deviations.ravel()[: 4 + coefficients],
+        {view.name: float(error) for view, error in zip(views, errors.ravel(), strict=True)},
+        {},
+    )
+
+
+def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
+    """The board's pose in the camera's frame, (4, 4), from one photograph."""
+    lens = _lens(camera)
+    # A flat board has two poses that look alike; the first is the one with the smaller error.
+    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, corners.pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
+    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, *lens, turns[0], shifts[0])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    return pose
+
+
+def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
+    """A photograph as it is and, beside it, without its lens distortion, as an image file of the kind `suffix`."""
+    picture = cv2.cvtColor(images.read(path), cv2.COLOR_RGB2BGR)
+    straight = cv2.undistort(picture, *_lens(camera))
+    return cv2.imencode(suffix, np.concatenate([picture, straight], axis=1))[1].tobytes()
+
+
+def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
+
+
+def board_error(camera: Camera, corners: Corners) -> float:
+    """Root mean square reprojection error of a view with the best pose, pixels."""
+    pose = board_pose(camera, corners)
+    turn, _ = cv2.Rodrigues(pose[:3, :3])
+    pixels, _ = cv2.projectPoints(corners.points, turn, pose[:3, 3], *_lens(camera))
+    return float(np.sqrt(np.square(pixels[:, 0] - corners.pixels).sum(-1).mean()))
+
+
+def _check_different(views: Sequence[View], size: tuple[int, int]) -> None:
+    """Count views that are not repetitions of an earlier one."""
+    different: list[Corners] = []
+    for view in views:
+        if all(_apart(view.corners, other) > SAME_VIEW * np.hypot(*size) for other in different):
+            different.append(view.corners)
+    if len(different) < MIN_VIEWS:
+        raise UserError(
+            f"only {len(different)} of {len(views)} views differ and a calibration takes {MIN_VIEWS}: photograph the "
+            "board from different sides and distances, tilted, all over the picture"
+        )
+
+
+def _apart(a: Corners, b: Corners) -> float:
+    """Mean distance in the picture between the corners that two views share, pixels; infinite if they share none."""
+    places = {tuple(point): pixel for point, pixel in zip(b.points, b.pixels, strict=True)}
+    apart = [
+        np.linalg.norm(pixel - places[key])
+        for point, pixel in zip(a.points, a.pixels, strict=True)
+        if (key := tuple(point)) in places
+    ]
+    return float(np.mean(apart)) if apart else np.inf
+
+
+def _check_agreement(views: Sequence[View], result: Calibration) -> None:
+    """Compare the error with that of views calibrated one by one, where they have corners enough for that."""
+    matrix, distortion = _lens(result.camera)
+    flags = COUNT_FLAGS[len(distortion)] | cv2.CALIB_USE_INTRINSIC_GUESS
+    together, alone = [], []
+    for name, (points, pixels) in views:
+        spare = (
+            1 - (10 + len(distortion)) / pixels.size
+        )  # Fitted are the pose, two focal lengths, the centre, the lens.
+        if spare > 0.5:
+            size = result.camera.width, result.camera.height
+            rms, *_ = cv2.calibrateCamera([points], [pixels], size, matrix.copy(), distortion.copy(), flags=flags)
+            together.append(result.errors[name])
+            alone.append(rms / np.sqrt(spare))
+    if together and (ratio := np.median(together) / np.median(alone)) > DISAGREEMENT:
+        raise UserError(
+            f"the views do not fit one camera: {np.median(together):.2f} pixels off together, {ratio:.1f} times what "
+            "they are one by one; use one camera, one zoom and focus, and a board that is flat"
+        )
+
+
+def _check_deviations(result: Calibration) -> None:
+    values, deviations = result.intrinsics, result.deviations
+    side = max(result.camera.width, result.camera.height)
+    for name, value, deviation, scale in zip(INTRINSICS, values, deviations, [*values[:2], side, side], strict=False):
+        limit = MAX_DEVIATION * scale
+        if not deviation <= limit:  # NaN is refused too.
+            raise UserError(
+                f"{name} = {value:.1f} +- {deviation:.1f} pixels (standard deviation) and {limit:.1f} is the limit: "
+                "add photographs with the board tilted by 30 to 45 degrees, near, and at the corners"
+            )
+
+
+def _one_size(sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
+    (size, _), *more = Counter(sizes.values()).most_common()
+    if more:
+        others = [f"{name} ({w}x{h})" for name, (w, h) in sizes.items() if (w, h) != size]
+        raise UserError(
+            f"the photographs differ in size: most have {size[0]}x{size[1]} pixels, but not {', '.join(others[:10])}; "
+            "leave those out, or calibrate each size by itself"
+        )
+    return size
+
+
+def names(paths: Sequence[Path]) -> list[str]:
+    """File names, with their folders where two are the same."""
+    count = Counter(path.name for path in paths)
+    return [path.name if count[path.name] == 1 else str(path) for path in paths]
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """A photograph in grey, (h, w), uint8."""
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    if picture is None:
+        raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
+    return picture

@@ -1,0 +1,1 @@
+"""The detector that ships: objects of the catalogue on a table."""

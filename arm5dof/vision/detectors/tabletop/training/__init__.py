@@ -1,0 +1,1 @@
+"""Training the tabletop detector from nothing."""

@@ -1,0 +1,1 @@
+"""How good detection and localization are, on scenes never seen."""

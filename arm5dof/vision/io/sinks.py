@@ -1,0 +1,160 @@
+"""Where detections go, or the places of things: a JSON list, a table, images or a video with the boxes drawn in.
+
+Each is a context that gives a function to call with every frame and what was found in it, in turn.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import cv2
+import numpy as np
+
+from arm5dof.errors import UserError
+from arm5dof.runtime import files
+from arm5dof.vision.detections import Detections
+from arm5dof.vision.io.annotate import annotate
+from arm5dof.vision.io.sources import IMAGE_SUFFIXES, USUAL_RATE, Frame, Source
+from arm5dof.vision.opencv import quiet
+
+Write = Callable[[Frame, Any], None]
+AsJSON = Callable[[Frame, Any], dict[str, Any]]
+Draw = Callable[[np.ndarray, Any], np.ndarray]
+"""Takes an RGB uint8 image (h, w, 3) and what was found in it."""
+Show = Callable[[Frame, np.ndarray], None]
+"""Takes a frame and its picture with the boxes drawn in."""
+
+
+def as_json(frame: Frame, found: Detections) -> dict[str, Any]:
+    """One frame: its name, seconds since the beginning (null for a photograph), width and height, and its detections,
+    the most confident first, with their edges in pixels: pixel i covers [i, i + 1)."""
+    height, width = frame.image.shape[:2]
+    time = None if frame.time is None else round(frame.time, 4)
+    return {"name": frame.name, "time_s": time, "image_size": [width, height], "detections": found.rows()}
+
+
+@contextmanager
+def json_list(stream: TextIO, as_json: AsJSON = as_json) -> Iterator[Write]:
+    """A JSON list with a frame in each line, so that a program can follow it and a person can read it."""
+    before = "[\n"
+
+    def write(frame: Frame, found: Any) -> None:
+        nonlocal before
+        stream.write(before + json.dumps(as_json(frame, found)))
+        stream.flush()
+        before = ",\n"
+
+    try:
+        yield write
+    finally:
+        stream.write("[]\n" if before == "[\n" else "\n]\n")
+
+
+@contextmanager
+def table(stream: TextIO) -> Iterator[Write]:
+    """For people: each frame and, below it, what was found."""
+    head = f"  {'class':16} conf     left      top    right   bottom\n"
+
+    def write(frame: Frame, found: Detections) -> None:
+        nonlocal head
+        height, width = frame.image.shape[:2]
+        at = "" if frame.time is None else f" at {frame.time:.2f} s"
+        lines = [f"{frame.name}{at}, {width} x {height}"]
+        for row in found.rows():
+            edges = "".join(f"{edge:9.1f}" for edge in row["xyxy"])
+            lines.append(f"  {row['class_name']:16} {row['confidence']:.2f} {edges}")
+        stream.write(head + "\n".join(lines if len(found) else [*lines, "  nothing"]) + "\n")
+        head = ""
+
+    yield write
+
+
+@contextmanager
+def folder(
+    path: Path, source: Source, list_name: str = "detections.json", as_json: AsJSON = as_json, draw: Draw = annotate
+) -> Iterator[Write]:
+    """A folder with a JSON list and the frames with boxes drawn in: images named as the photographs are, or a video.
+    The folder appears when all is in it, and not at all if the block fails."""
+    with ExitStack() as stack:
+        temporary = stack.enter_context(files.making(path))
+        text = stack.enter_context(open(temporary / list_name, "w", encoding="utf-8"))
+        note = stack.enter_context(json_list(text, as_json))
+        show = _images(temporary) if source.rate is None else stack.enter_context(_video(temporary, source))
+
+        def write(frame: Frame, found: Any) -> None:
+            show(frame, draw(frame.image, found))
+            note(frame, found)
+
+        yield write
+
+
+def _images(into: Path) -> Show:
+    """A file for each frame, in the format of the photograph that it was, or PNG. Two of a name get numbers."""
+
+    def show(frame: Frame, picture: np.ndarray) -> None:
+        name = Path(frame.name).name
+        wanted = into / (name if name.lower().endswith(IMAGE_SUFFIXES) else f"{name}.png")
+        others = (wanted.with_stem(f"{wanted.stem}-{i}") for i in itertools.count(2))
+        path = next(p for p in itertools.chain([wanted], others) if not p.exists())
+        _, content = cv2.imencode(path.suffix.lower(), picture[..., ::-1])
+        path.write_bytes(content.tobytes())
+
+    return show
+
+
+@contextmanager
+def _video(into: Path, source: Source) -> Iterator[Show]:
+    """An MP4 at the source's rate."""
+    video = _Video(into, source.rate or USUAL_RATE, source.live)
+    try:
+        yield video.show
+    finally:
+        video.close()
+    video.check()
+
+
+class _Video:
+    """MPEG-4 part 2: players show it, browsers do not. All else that pip's OpenCV can put into an MP4 is VP9, which
+    takes several times longer."""
+
+    def __init__(self, into: Path, rate: float, live: bool) -> None:
+        self._into, self._rate, self._live = into, rate, live
+        self._encoder = cv2.VideoWriter()
+        self._written = 0
+
+    def show(self, frame: Frame, picture: np.ndarray) -> None:
+        if not self._written:
+            self._open(Path(frame.name).stem, picture)
+        if picture.shape[1::-1] != self._size:  # The encoder would leave it out without a word.
+            picture = cv2.resize(picture, self._size)
+        # A camera's frames come as fast as they are looked at; the video runs as fast as the clock did.
+        due = round((frame.time or 0) * self._rate) + 1 if self._live else 0
+        for _ in range(max(1, due - self._written)):
+            with quiet():
+                self._encoder.write(picture[..., ::-1])
+            self._written += 1
+
+    def close(self) -> None:
+        self._encoder.release()
+
+    def check(self) -> None:
+        """Raise `UserError` unless every frame is in the file: the encoder tells nobody of a full disk."""
+        if self._written:
+            with quiet():
+                capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+            if capture.get(cv2.CAP_PROP_FRAME_COUNT) != self._written:
+                raise UserError("the annotated video could not be written whole: is the disk full?")
+
+    def _open(self, name: str, picture: np.ndarray) -> None:
+        self._path, self._size = self._into / f"{name}.mp4", picture.shape[1::-1]
+        with quiet():
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            self._encoder.open(str(self._path), cv2.CAP_FFMPEG, code, self._rate, self._size)
+        if not self._encoder.isOpened():
+            width, height = self._size
+            raise UserError(f"OpenCV cannot write a video of {width} x {height} at {self._rate:g} frames per second")

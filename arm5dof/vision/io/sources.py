@@ -1,0 +1,188 @@
+"""Where images come from: photographs, folders of them, a video, a camera, or random scenes drawn for the purpose. One
+after another, as frames."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from arm5dof.errors import UserError
+from arm5dof.vision import images
+from arm5dof.vision.opencv import quiet
+
+if TYPE_CHECKING:
+    from arm5dof.vision.camera import Camera
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+"""What counts as a photograph in a folder; a file that is named may be called anything."""
+
+SCENES = 10
+"""How many random scenes are drawn unless a number is given."""
+
+USUAL_RATE = 30.0
+"""Frames per second where a video or camera does not say."""
+
+TEXT = cv2.VideoWriter.fourcc(*"ansi")
+"""What FFmpeg calls a text file, which it shows as if it were typed onto a screen."""
+
+MISSING_S = 0.5
+"""What may be missing at a video's end. What it states of its length is an estimate in some formats, and its sound may
+be a little longer than its pictures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An image, and what it is."""
+
+    name: str
+    """Of the file as it was given, or of the camera."""
+    image: np.ndarray
+    """RGB uint8 (h, w, 3)."""
+    time: float | None = None
+    """Seconds since the beginning of the video, or the camera's first frame; None for a photograph."""
+    camera: Camera | None = None
+    """What it was drawn for, known exactly; None for what a real camera took."""
+
+
+Frames = Generator[Frame, None, None]
+"""To be closed, which lets go of the file or camera. Raises `UserError` where it cannot go on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Frames, and what is known of them beforehand."""
+
+    frames: Frames
+    length: int | None
+    """How many there will be, as far as that is known."""
+    rate: float | None = None
+    """Frames per second of a video or camera; None for photographs, which are of many sizes."""
+    live: bool = False
+    """A camera: its frames come when they come, and it goes on until somebody stops it."""
+    drawn: bool = False
+    """Random scenes: each frame brings its camera."""
+
+
+def open_source(given: Sequence[str]) -> Source:
+    """What a command line names: a camera by its number, `simulated` or `simulated:N` for random scenes, a video file,
+    or any number of photographs and folders.
+
+    Raises `UserError` if it is none of these, or several that do not go together.
+    """
+    if len(given) == 1 and re.fullmatch(r"\d{1,3}", given[0]):
+        return camera(int(given[0]))
+    if len(given) == 1 and (match := re.fullmatch(r"simulated(?::(\d{1,6}))?", given[0])):
+        return simulated(int(match[1] or SCENES))
+    paths = [Path(text) for text in given]
+    for path in paths:
+        if not path.exists():
+            raise UserError(f"no image, video or folder {str(path)!r}")
+    videos = [path for path in paths if _is_video(path)]
+    if videos and len(paths) > 1:
+        raise UserError(f"{videos[0]} is no image: give one video by itself, or photographs and folders of them")
+    return video(videos[0]) if videos else photographs(image_files(paths))
+
+
+def image_files(given: Sequence[Path]) -> list[Path]:
+    """The photographs named, and those in the folders named, each once, in order."""
+    found: dict[Path, None] = {}
+    for path in given:
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+            if not inside:
+                raise UserError(f"folder {path} holds no images ({', '.join(IMAGE_SUFFIXES)})")
+            found.update(dict.fromkeys(inside))
+        elif path.is_file():
+            found[path] = None
+        else:
+            raise UserError(f"no image and no folder {str(path)!r}")
+    return list(found)
+
+
+def photographs(paths: Sequence[Path]) -> Source:
+    """Image files."""
+    return Source((Frame(str(path), images.read(path)) for path in paths), len(paths))
+
+
+def video(path: Path) -> Source:
+    """A video file. Raises `UserError` if it is none that FFmpeg reads; its frames do where it ends before its time."""
+    with quiet():
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened() or int(capture.get(cv2.CAP_PROP_FOURCC)) == TEXT:
+        raise UserError(f"{path} is empty, damaged, or no image or video that OpenCV reads: give an MP4 or AVI file")
+    rate = _rate(capture)
+    stated = max(0, round(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+
+    def frames() -> Frames:
+        end = 0.0
+        try:
+            while (image := _next(capture)) is not None:
+                start = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+                end = start + 1 / rate
+                yield Frame(str(path), image, start)
+        finally:
+            capture.release()
+        if end == 0:
+            raise UserError(f"{path} is a video without a picture: it is damaged or cut short")
+        if end < stated / rate - MISSING_S:
+            raise UserError(f"{path} breaks off after {end:.1f} of {stated / rate:.1f} s: it is damaged or cut short")
+
+    return Source(frames(), stated or None, rate)
+
+
+def camera(index: int) -> Source:
+    """A camera of this machine, counted from 0. Raises `UserError` if it cannot be opened; its frames do when it is
+    taken away."""
+    with quiet():
+        capture = cv2.VideoCapture(index)
+    if not capture.isOpened():
+        raise UserError(f"no camera {index} can be opened: plug it in, close what else uses it, or give another number")
+
+    def frames() -> Frames:
+        first = None
+        try:
+            while (image := _next(capture)) is not None:
+                now = time.monotonic()
+                first = now if first is None else first
+                yield Frame(f"camera{index}", image, now - first)
+        finally:
+            capture.release()
+        raise UserError(f"camera {index} gives no picture{' any more' if first else ''}: was it unplugged or closed?")
+
+    return Source(frames(), None, _rate(capture), live=True)
+
+
+def simulated(count: int) -> Source:
+    """The first random scenes in the style of evaluation, 640 x 480. Raises `UserError` for none."""
+    if count < 1:
+        raise UserError("simulated:0 is no scene: ask for one or more")
+    from arm5dof.vision.synthetic.samples import shoot  # MuJoCo takes its time to import.
+
+    names = (f"scene{number}.png" for number in range(count))
+    shots = ((name, shoot(number, 0, "evaluation", "auto")) for number, name in enumerate(names))
+    return Source((Frame(name, shot.picture, camera=shot.camera) for name, shot in shots), count, drawn=True)
+
+
+def _is_video(path: Path) -> bool:
+    """Whether a file is to be read as a video: it neither is called an image nor begins like one."""
+    return path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES and not cv2.haveImageReader(str(path))
+
+
+def _rate(capture: cv2.VideoCapture) -> float:
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    return rate if math.isfinite(rate) and rate > 0 else USUAL_RATE
+
+
+def _next(capture: cv2.VideoCapture) -> np.ndarray | None:
+    """The next frame, RGB uint8 (h, w, 3); None if there is none."""
+    with quiet():
+        found, image = capture.read()
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if found else None

@@ -1,0 +1,1 @@
+"""From boxes in images to points in the arm's base frame."""

@@ -1,0 +1,64 @@
+"""Photographs of boards, drawn through a camera that is known."""
+
+import functools
+
+import cv2
+import numpy as np
+
+from arm5dof.vision.calibration.boards import Charuco
+from arm5dof.vision.camera import Camera
+
+TRUE = Camera(
+    matrix=np.array([[700, 0, 321.5], [0, 705, 236], [0, 0, 1.0]]),
+    distortion=np.array([-0.2, 0.05, 1e-3, -5e-4, 0]),
+    rotation=np.eye(3),
+    position=np.zeros(3),
+    width=640,
+    height=480,
+)
+
+
+OVERSAMPLING = 2
+
+
+@functools.cache
+def rays():
+    """Where the true camera's pixels, and those between them, look on the plane at depth 1, (h, w, 2)."""
+    u, v = (np.arange(OVERSAMPLING * n) for n in (TRUE.width, TRUE.height))
+    pixels = (np.stack(np.meshgrid(u, v), -1) + 0.5) / OVERSAMPLING - 0.5
+    plane = cv2.undistortPoints(pixels.reshape(-1, 1, 2), TRUE.matrix, TRUE.distortion)
+    return plane.reshape(pixels.shape)
+
+
+def photograph(drawing, metres_per_pixel, origin, pose):
+    """What the true camera sees of a drawing whose pixel `origin` is the board's origin, at the board's pose (4, 4)
+    in the camera's frame."""
+    homography = np.linalg.inv(np.c_[pose[:3, :2], pose[:3, 3]])
+    place = rays() @ homography[:, :2].T + homography[:, 2]
+    place = (place[..., :2] / place[..., 2:] / metres_per_pixel + origin).astype(np.float32)
+    picture = cv2.remap(drawing, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=200)
+    return cv2.resize(picture, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
+
+
+def poses(rng, n, middle, distance=0.5):
+    """Board poses (4, 4) in front of the camera, tilted by up to 40 degrees."""
+    for _ in range(n):
+        turn, _ = cv2.Rodrigues(np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1)]))
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        at = np.array([*rng.uniform(-0.06, 0.06, 2), distance * rng.uniform(0.9, 1.3)])
+        pose[:3, 3] = at - turn @ [*middle, 0]
+        yield pose
+
+
+def draw(board):
+    """A drawing, its metres per pixel, and the pixel of the board's origin."""
+    scale = 24
+    if isinstance(board, Charuco):
+        picture = board.opencv.generateImage((scale * board.columns, scale * board.rows), marginSize=0)
+        return picture, board.square / scale, np.array([scale - 0.5, scale - 0.5])
+    squares = np.indices((board.rows + 1, board.columns + 1)).sum(0) % 2 * 255
+    picture = cv2.copyMakeBorder(
+        np.kron(squares, np.ones((scale, scale))).astype(np.uint8), *[scale] * 4, cv2.BORDER_CONSTANT, value=255
+    )
+    return picture, board.square / scale, np.array([2 * scale - 0.5, 2 * scale - 0.5])

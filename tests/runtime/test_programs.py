@@ -1,0 +1,160 @@
+"""Traced programs on disk: found again for the same thing only, and never needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from arm5dof.arm import Arm, load_arm
+from arm5dof.ddpg import DDPG
+from arm5dof.envs import Reach, ReachConfig
+from arm5dof.runtime import xla
+from arm5dof.runtime.programs import Program
+from arm5dof.training.config import Config, build
+from arm5dof.training.run import make_trainer
+from arm5dof.training.trainer import Trainer
+
+SMALL = {
+    "env": {"dynamics": "kinematic", "episode_length": 4},
+    "ddpg": {"batch_size": 4, "updates_per_step": 2, "replay_capacity": 64, "heads": 2},
+    "train": {"episodes": 8, "num_envs": 4, "epoch_steps": 2, "evaluate_every": 4, "checkpoint_every": 4},
+}
+X = jnp.linspace(0.1, 2, 8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(xla, "_programs", tmp_path / "cache" / "traced")
+    return tmp_path / "cache" / "traced"
+
+
+def wave(x: jax.Array, scale: dict[str, float]) -> list[jax.Array]:
+    return [jnp.sin(x * scale["by"]), jax.lax.fori_loop(0, 5, lambda _, y: jnp.cos(y), x)]
+
+
+def unexpected(*_: object) -> None:
+    raise AssertionError("traced again")
+
+
+def program(*identity: object, function=wave, x: jax.Array = X) -> Program:
+    unexpected.__name__ = "wave"  # What a program is called is a part of what it is found by.
+    return Program(function, (x, {"by": 2.0}), identity)
+
+
+def test_a_kept_program_is_not_traced_again(folder: Path):
+    first = program("arm").jit()(X, {"by": 3.0})
+    again = program("arm", function=unexpected).jit()(X, {"by": 3.0})
+    direct = jax.jit(wave)(X, {"by": 3.0})
+    for values in (first, again):
+        assert jax.tree.structure(values) == jax.tree.structure(direct)
+        for left, right in zip(values, direct, strict=True):
+            np.testing.assert_array_equal(left, right)
+    assert [path.name.split("-")[0] for path in folder.iterdir()] == ["wave"]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda: program("another arm", function=unexpected),
+        lambda: program("arm", function=unexpected, x=X[1:]),
+        lambda: program("arm", function=unexpected, x=X.astype(jnp.int32)),
+    ],
+)
+def test_nothing_else_finds_it(folder: Path, other):
+    program("arm").jit()
+    assert other().kept is None
+    with pytest.raises(AssertionError, match="traced again"):
+        other().jit()
+
+
+def test_the_model_is_part_of_what_a_program_is_found_by(folder: Path, arm: Arm):
+    program(arm.mj_model).jit()
+    other = load_arm("reach.xml")
+    assert program(other.mj_model).kept is not None
+    other.mj_model.body_pos[1] += 1e-12
+    assert program(other.mj_model).kept is None
+
+
+def test_jaxs_configuration_is_part_of_what_a_program_is_found_by(folder: Path):
+    program("arm").jit()
+    before = jax.config.values["jax_default_matmul_precision"]
+    try:
+        jax.config.update("jax_default_matmul_precision", "bfloat16")
+        assert program("arm").kept is None
+    finally:
+        jax.config.update("jax_default_matmul_precision", before)
+    assert program("arm").kept is not None
+
+
+@pytest.mark.parametrize("spoil", [lambda b: b[:-1], lambda b: b"", lambda b: b[:50] + bytes([b[50] ^ 1]) + b[51:]])
+def test_a_spoilt_file_is_made_anew(folder: Path, spoil):
+    program("arm").jit()
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(spoil(whole))
+    assert program("arm").kept is None
+    program("arm").jit()
+    assert program("arm", function=unexpected).jit()(X, {"by": 1.0})[0].shape == X.shape
+
+
+def test_where_nothing_can_be_kept_all_works(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    folder.parent.write_text("a file where the folder should be")
+    np.testing.assert_allclose(program("arm").jit()(X, {"by": 2.0})[0], np.sin(2 * np.asarray(X)), atol=1e-6)
+    monkeypatch.setattr(xla, "_programs", None)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, program("arm").jit()(X, {"by": 2.0}), wave(X, {"by": 2.0})))
+
+
+def test_a_program_that_jax_cannot_keep_runs(folder: Path):
+    def wave(x: jax.Array, scale: dict[str, float]) -> jax.Array:
+        return jax.pure_callback(lambda y: 2 * np.asarray(y), jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    np.testing.assert_array_equal(program(function=wave).jit()(X, {"by": 1.0}), 2 * X)
+    assert not folder.exists()
+
+
+def trained(trainer: Trainer) -> list[np.ndarray]:
+    trainer.start()
+    for _ in range(3):
+        trainer.advance()
+    return [np.asarray(leaf) for leaf in jax.tree.leaves((trainer.state.networks, trainer.state.replay.rows))]
+
+
+def settings(**ddpg: float) -> Config:
+    return build({**SMALL, "ddpg": {**SMALL["ddpg"], **ddpg}}, "test")
+
+
+def test_training_has_the_same_bits_with_and_without(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    kept = trained(make_trainer(settings()))
+    assert len(list(folder.glob("epoch-*"))) == 1
+    monkeypatch.setattr(DDPG, "epoch", unexpected)
+    again = trained(make_trainer(settings()))
+    monkeypatch.undo()
+    monkeypatch.setattr(xla, "_programs", None)
+    without = trained(make_trainer(settings()))
+    for a, b, c in zip(kept, again, without, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+
+
+def test_numbers_share_a_program_and_sizes_do_not(folder: Path):
+    """Step sizes and the like are inputs of the program, not parts of it."""
+    first = trained(make_trainer(settings()))
+    other = trained(make_trainer(settings(actor_lr=1e-4)))
+    assert len(list(folder.glob("epoch-*"))) == 1
+    assert any((a != b).any() for a, b in zip(first, other, strict=True))
+    trained(make_trainer(settings(heads=3)))
+    assert len(list(folder.glob("epoch-*"))) == 2
+
+
+def test_an_environment_of_others_is_not_kept(folder: Path, arm: Arm):
+    """Its source is not ours, so nothing would say that it has changed."""
+
+    class Mine(Reach):
+        pass
+
+    trained(Trainer(Mine(arm, ReachConfig(dynamics="kinematic", episode_length=4)), settings()))
+    assert not folder.exists()

@@ -1,0 +1,66 @@
+"""The XLA flag is set where it is known, and never over the user's own."""
+
+import os
+import subprocess
+import sys
+from importlib import metadata
+
+import pytest
+
+from arm5dof.runtime import xla
+
+
+@pytest.mark.parametrize("version", ["0.8.3", "0.9.2", "0.10.2", "0.10.2.dev20260101"])
+def test_known_versions_get_the_flag(version):
+    assert xla.flags("", version) == xla.FUSION_EMITTERS
+    assert xla.flags("--xla_dump_to=x", version) == f"--xla_dump_to=x {xla.FUSION_EMITTERS}"
+
+
+@pytest.mark.parametrize("version", ["0.4.30", "0.8.2", "0.10.3", "0.11.2", "1.0"])
+def test_unknown_versions_are_left_alone(version):
+    assert xla.flags("--xla_dump_to=x", version) == "--xla_dump_to=x"
+
+
+def test_the_users_own_setting_wins():
+    assert xla.flags("--xla_cpu_use_fusion_emitters=true", "0.10.2") == "--xla_cpu_use_fusion_emitters=true"
+
+
+@pytest.mark.parametrize("own", ["", "--xla_cpu_use_fusion_emitters=true"])
+def test_jax_starts_with_what_was_set(own):
+    code = "import arm5dof, os, jax; jax.devices(); print(os.environ.get('XLA_FLAGS', ''))"
+    environment = {**os.environ, "XLA_FLAGS": own}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert ("=true" in done.stdout) == bool(own)
+
+
+def test_one_program_may_choose_for_itself():
+    code = (
+        "import arm5dof, jax, jax.numpy as jnp; from arm5dof.runtime import xla;"
+        "print(xla.fusion_emitters(), jax.jit(jnp.sin, compiler_options=xla.fusion_emitters())(0.0))"
+    )
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == "0.0"
+    known = xla.flags("", metadata.version("jaxlib")) != ""
+    assert ("True" in done.stdout) == known
+
+
+@pytest.mark.parametrize("first", ["import jax;", ""])
+def test_programs_are_kept_in_the_cache_folder(first, tmp_path):
+    """Whether or not JAX was imported before; where the user wants it, and not at all if they do not."""
+    code = (
+        f"{first}from arm5dof.runtime import xla; xla.enable_compilation_cache(); import jax;"
+        "print(jax.config.jax_compilation_cache_dir, xla.programs_folder())"
+    )
+    unset = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+
+    def folders(**environment: str) -> list[str]:
+        done = subprocess.run(
+            [sys.executable, "-c", code], env={**unset, **environment}, capture_output=True, text=True, check=True
+        )
+        return done.stdout.split()
+
+    default = str(tmp_path / "arm5dof" / "xla")
+    assert folders(XDG_CACHE_HOME=str(tmp_path)) == [default, f"{default}/traced"]
+    assert folders(JAX_COMPILATION_CACHE_DIR="/somewhere") == ["/somewhere", "/somewhere/traced"]
+    assert folders(JAX_ENABLE_COMPILATION_CACHE="false")[1] == "None"

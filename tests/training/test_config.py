@@ -1,0 +1,120 @@
+"""Configuration: TOML in, TOML out, overrides, and what is said of mistakes."""
+
+import dataclasses
+import re
+
+import jax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arm5dof.ddpg import DDPGConfig
+from arm5dof.errors import UserError
+from arm5dof.runtime import files
+from arm5dof.training import config
+
+DEFAULT = config.build({}, "test")
+
+
+@pytest.mark.parametrize("name", files.shipped("experiments", ".toml"))
+def test_shipped_experiments_survive_a_round_trip(name, tmp_path):
+    loaded = config.load(name)
+    (tmp_path / "again.toml").write_text(config.dumps(loaded))
+    assert config.load(tmp_path / "again.toml") == loaded
+
+
+def test_default_experiment_is_the_papers_budget_in_servo_dynamics():
+    reach = config.load("reach.toml")
+    assert (reach.env.dynamics, reach.train.episodes, reach.env.episode_length) == ("servo", 400, 160)
+
+
+def test_names_are_unique_so_that_a_flag_needs_no_section():
+    names = [f.name for f in config.fields()]
+    assert len(names) == len(set(names))
+
+
+def test_every_field_is_documented_and_overridable():
+    for f in config.fields():
+        assert f.help, f.name
+        text = str(f.default).lower() if isinstance(f.default, bool) else str(f.default)
+        for flag in (f.name, f.name.replace("_", "-"), f"{f.section}.{f.name}"):
+            assert config.load("reach.toml", {flag: text}) is not None
+
+
+@given(
+    lr=st.floats(1e-9, 1.0),
+    discount=st.floats(0, 1),
+    batch=st.integers(1, 10**6),
+    norm=st.booleans(),
+    activation=st.sampled_from(["relu", "gelu", "tanh"]),
+)
+def test_any_valid_value_survives_text(lr, discount, batch, norm, activation):
+    overrides = {
+        "actor-lr": repr(lr),
+        "discount": repr(discount),
+        "batch_size": str(batch),
+        "ddpg.layer_norm": str(norm).lower(),
+        "activation": activation,
+    }
+    found = config.load("reach.toml", overrides).ddpg
+    assert (found.actor_lr, found.discount, found.batch_size) == (lr, discount, batch)
+    assert (found.layer_norm, found.activation) == (norm, activation)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"ddpg": {"batch_sise": 3}}, "did you mean 'batch_size'"),
+        ({"dppg": {}}, "did you mean 'ddpg'"),
+        ({"ddpg": {"batch_size": "many"}}, "ddpg.batch_size = 'many'"),
+        ({"ddpg": {"batch_size": 2.5}}, "integer"),
+        ({"ddpg": {"batch_size": 0}}, "greater than or equal to 1"),
+        ({"ddpg": {"discount": 1.5}}, "less than or equal to 1"),
+        ({"ddpg": {"actor_lr": float("nan")}}, "finite"),
+        ({"ddpg": {"layer_norm": 1}}, "boolean"),
+        ({"env": {"dynamics": "magic"}}, "'servo' or 'kinematic'"),
+        ({"env": 3}, "env"),
+    ],
+)
+def test_mistakes_are_named_in_one_line(values, said):
+    with pytest.raises(UserError) as caught:
+        config.build(values, "file.toml")
+    message = str(caught.value)
+    assert said in message and message.startswith("file.toml: ") and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"batch-sise": "3"}, "--batch-size"),
+        ({"zzz": "3"}, "--help"),
+        ({"batch-size": "many"}, "integer"),
+        ({"discount": "2"}, "less than"),
+        ({"seed": "-1"}, "greater than"),
+        ({"seed": "1]"}, "integer"),
+    ],
+)
+def test_mistakes_on_the_command_line(overrides, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        config.load("reach.toml", overrides)
+
+
+def test_numbers_are_traced_and_sizes_are_not():
+    leaves, _ = jax.tree.flatten(DDPGConfig())
+    traced = [f.name for f in dataclasses.fields(DDPGConfig) if not f.metadata.get("static")]
+    assert len(leaves) == len(traced)
+    assert {"actor_lr", "critic_lr", "discount", "tau", "noise"} <= set(traced)
+    assert not {"batch_size", "actor_width", "heads"} & set(traced)
+    changed = jax.tree.map(lambda x: 2 * x, DDPGConfig())
+    assert changed.actor_lr == 2 * DDPGConfig().actor_lr and changed.batch_size == DDPGConfig().batch_size
+
+
+def test_missing_and_broken_files(tmp_path):
+    with pytest.raises(UserError, match=r"kinematic\.toml, paper\.toml, reach\.toml"):
+        config.load("nothing.toml")
+    (tmp_path / "broken.toml").write_text("[env\n")
+    with pytest.raises(UserError, match="not valid TOML"):
+        config.load(tmp_path / "broken.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match="not valid TOML"):
+        config.load(tmp_path / "binary.toml")
