@@ -23,7 +23,7 @@ from arm5dof.training import config, run
 
 RESULTS = Path(__file__).parent / "results"
 
-STATE = "--critic-view state --critic-width 128 --critic-depth 3"
+STATE = "--critic-input state --critic-width 128 --critic-depth 3"
 """A critic that sees joint angles and action, and has to learn the arm's kinematics itself."""
 
 BUDGETS = {
@@ -42,10 +42,10 @@ BASE = "kinematic.toml --episodes 100"
 SHORT = "kinematic.toml --episodes 25 --num-envs 25"
 ABLATIONS = {
     "the recipe": BASE,
-    "no random actions": f"{BASE} --random 0",
-    "no relabelling in hindsight": f"{BASE} --relabel 0",
-    "all goals relabelled": f"{BASE} --relabel 1",
-    "critic without focus": f"{BASE} --critic-focus 0",
+    "no random actions": f"{BASE} --random-action-prob 0",
+    "no relabelling in hindsight": f"{BASE} --her-ratio 0",
+    "all goals relabelled": f"{BASE} --her-ratio 1",
+    "critic without focus": f"{BASE} --critic-error-weight 0",
     "scalar critic": f"{BASE} --critic-form scalar",
     "scalar critic of width 128, depth 3": f"{BASE} --critic-form scalar --critic-width 128 --critic-depth 3",
     "state critic": f"{BASE} {STATE}",
@@ -66,7 +66,7 @@ ABLATIONS = {
     "the paper's observations": f"{BASE} --observation paper",
     "25 episodes": SHORT,
     "25 episodes, Adam's usual memory of 0.999": f"{SHORT} --adam-b2 0.999",
-    "25 episodes, all goals relabelled": f"{SHORT} --relabel 1",
+    "25 episodes, all goals relabelled": f"{SHORT} --her-ratio 1",
 }
 
 TEN_SEEDS = ("100 episodes, kinematic",)

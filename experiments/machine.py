@@ -43,7 +43,7 @@ def reach(dynamics: str = "servo"):
     from arm5dof.arm import load_arm
     from arm5dof.envs import Reach, ReachConfig
 
-    return Reach(load_arm("reach.xml"), ReachConfig(dynamics=dynamics))
+    return Reach(ReachConfig(dynamics=dynamics), load_arm("reach.xml"))
 
 
 def env(batch: int = 1024, steps: int = 20) -> dict[str, float]:

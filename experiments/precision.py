@@ -54,7 +54,7 @@ def closed_forms(arm: Arm) -> dict[str, str]:
 
 def physics(arm: Arm) -> dict[str, str]:
     """The servo environment in MJX and the same actions in C MuJoCo."""
-    env = Reach(arm, ReachConfig(dynamics="servo"))
+    env = Reach(ReachConfig(dynamics="servo"), arm)
     q = arm.sample(jax.random.key(0), (ENVS,))
     action = jax.random.uniform(jax.random.key(1), (STEPS, ENVS, arm.dof), minval=-1.0, maxval=1.0)
 

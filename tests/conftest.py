@@ -43,7 +43,7 @@ def kinematic(arm: Arm) -> Reach:
     """Reach where an action is the pose."""
     from arm5dof.envs import Reach, ReachConfig
 
-    return Reach(arm, ReachConfig(dynamics="kinematic"))
+    return Reach(ReachConfig(dynamics="kinematic"), arm)
 
 
 @pytest.fixture(scope="session")
@@ -51,4 +51,4 @@ def servo(arm: Arm) -> Reach:
     """Reach in MJX physics, with the observation that holds velocities too."""
     from arm5dof.envs import Reach, ReachConfig
 
-    return Reach(arm, ReachConfig(dynamics="servo", observation="full"))
+    return Reach(ReachConfig(dynamics="servo", observation="full"), arm)

@@ -26,9 +26,9 @@ def wheel(tmp_path_factory):
 def test_models_and_experiments_are_found_from_an_installed_wheel(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     code = (
-        "import arm5dof; from arm5dof.arm import load_arm;"
-        "from arm5dof.runtime import files; from arm5dof.training import config;"
-        "print(arm5dof.__file__, load_arm(config.load('reach.toml').env.arm).dof, *files.shipped('mjcf', '.xml'))"
+        "import arm5dof; from arm5dof import load_arm, load_config;"
+        "from arm5dof.runtime import files;"
+        "print(arm5dof.__file__, load_arm(load_config('reach.toml').env.arm).dof, *files.shipped('mjcf', '.xml'))"
     )
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     done = subprocess.run(

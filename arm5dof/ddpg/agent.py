@@ -18,7 +18,7 @@ from flax import struct
 from arm5dof.ddpg import losses
 from arm5dof.ddpg.networks import Actor, Critic
 from arm5dof.ddpg.replay import Replay, Transition
-from arm5dof.envs.base import Env, GoalEnv, Observation, State
+from arm5dof.envs.base import Env, ForwardModel, GoalEnv, Observation, State
 from arm5dof.envs.vector import VectorEnv
 from arm5dof.errors import UserError
 from arm5dof.settings import settings, static
@@ -32,41 +32,45 @@ Count = Annotated[int, Ge(1)]
 
 @settings
 class DDPGConfig:
-    """The agent."""
+    """The agent. Defaults are for ordinary control; what suits a task better stands in the task's TOML."""
 
-    actor_lr: Positive = 5e-3
+    actor_lr: Positive = 1e-3
     """Adam's step size for the actor at the start of training."""
-    critic_lr: Positive = 3e-3
+    critic_lr: Positive = 1e-3
     """Adam's step size for the critic at the start of training."""
     final_lr: Unit = 0.0
     """Share of both step sizes that is left at the end; they follow a cosine."""
     adam_b2: Annotated[float, Ge(0), Lt(1)] = 0.99
     """How long Adam remembers the size of gradients. It shrinks as the networks learn: the usual 0.999 is slow."""
-    discount: Unit = 0.0
-    """gamma in Eq. 4. With absolute joint targets an answer is judged at once, so 0 is enough."""
+    discount: Unit = 0.98
+    """gamma in Eq. 4. Where an action is judged at once, as with absolute joint targets, 0 is enough."""
     tau: Unit = 0.01
     """How far the target networks follow at each update."""
     noise: Annotated[float, Ge(0)] = 0.5
-    """Standard deviation of the normal exploration noise at the start, in units of half a joint's range."""
+    """Standard deviation of the normal exploration noise at the start; actions are in [-1, 1]."""
     final_noise: Annotated[float, Ge(0)] = 0.05
     """The same at the end of training; it falls linearly."""
-    random: Unit = 1.0
+    random_action_prob: Unit = 0.0
     """Share of actions that are drawn uniformly at random at the start of training; it falls linearly to none. What
     they reach covers the workspace, and hindsight makes goals of it."""
-    relabel: Unit = 0.8
-    """Share of sampled transitions whose goal is exchanged in hindsight for a point reached in another one."""
-    temperature: Positive = 0.01
-    """How sharply heads divide the targets among them, in units of reward (metres)."""
-    heads: Count = static(default=8)
+    her_ratio: Unit = 0.8
+    """Share of sampled transitions whose goal is exchanged in hindsight, where the task has goals."""
+    her_goals: Literal["buffer", "future"] = static(default="buffer")
+    """Where goals in hindsight come from. buffer: what any transition reached, for tasks of one step; future: what
+    was reached later in the same episode, for tasks of many."""
+    head_temperature: Positive = 0.01
+    """How sharply heads divide the observations among them, in units of reward."""
+    heads: Count = static(default=1)
     """Candidate answers of the actor, among which the critic chooses. 1 is plain DDPG."""
-    critic_focus: Annotated[float, Ge(0)] = 10.0
-    """An error of the critic at a target value v counts 1 / (1 + critic_focus |v|) times; 1 / units of reward (metres).
-    The actor learns the last millimetres from values near a goal. 0: all count alike."""
-    critic_view: Literal["outcome", "state"] = static(default="outcome")
-    """outcome: the critic sees where the action leads by the arm's forward model, as the paper's does; state: it
-    sees the observation and the action."""
-    critic_form: Literal["distance", "scalar"] = static(default="distance")
-    """distance: Q is minus a learnt distance, for rewards that are minus a distance; scalar: Q is any number."""
+    critic_error_weight: Annotated[float, Ge(0)] = 0.0
+    """An error of the critic at a target value v counts 1 / (1 + critic_error_weight |v|) times; 1 / units of reward.
+    Where rewards are minus a distance the actor learns the last millimetres from values near a goal. 0: all count
+    alike."""
+    critic_input: Literal["outcome", "state"] = static(default="state")
+    """state: the critic sees the observation and the action; outcome: it sees where the action leads by the task's
+    forward model, as the paper's does."""
+    critic_form: Literal["distance", "scalar"] = static(default="scalar")
+    """scalar: Q is any number; distance: Q is minus a learnt distance, for rewards that are minus a distance."""
     batch_size: Count = static(default=64)
     """Transitions in an update."""
     updates_per_step: Count = static(default=128)
@@ -100,8 +104,8 @@ class Training(struct.PyTreeNode):
     """Everything a run is made of: restored, it goes on as if nothing had happened."""
 
     networks: Networks
-    actor_optimiser: optax.OptState
-    critic_optimiser: optax.OptState
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
     replay: Replay
     env: State
     key: jax.Array
@@ -120,11 +124,13 @@ class DDPG:
 
     def __init__(self, env: Env, config: DDPGConfig, num_envs: int, episode_length: int, total_steps: int) -> None:
         self.goal_env: GoalEnv | None = env if isinstance(env, GoalEnv) else None
-        if config.critic_view == "outcome" and self.goal_env is None:
-            raise UserError("this environment foresees no outcome of an action: train with --critic-view state")
+        self.forward_model: ForwardModel | None = env if isinstance(env, ForwardModel) else None
+        if config.critic_input == "outcome" and self.forward_model is None:
+            raise UserError('this environment foresees no outcome of an action: choose critic_input = "state"')
         if config.critic_form == "distance" and self.goal_env is None:
-            raise UserError("this environment's rewards may be no distances: train with --critic-form scalar")
+            raise UserError('this environment\'s rewards may be no distances: choose critic_form = "scalar"')
         self.vector = VectorEnv(env, episode_length)
+        self.episode_length = episode_length
         self.num_envs = num_envs
         self.total_steps = total_steps
         style = (config.activation, config.layer_norm)
@@ -138,34 +144,34 @@ class DDPG:
         obs = jax.tree.map(lambda x: x[0], env.obs)
         action = jnp.zeros(self.vector.env.action_size)
         actor = self.actor.init(actor_key, obs["state"])
-        critic = self.critic.init(critic_key, self.view(config, obs, action))
+        critic = self.critic.init(critic_key, self.critic_input(config, obs, action))
         zero = jnp.zeros(())
-        example = Transition(obs, action, zero, obs, zero, zero)
-        capacity = -(-config.replay_capacity // self.num_envs) * self.num_envs
         count = jnp.zeros((), jnp.int32)
+        example = Transition(obs, action, zero, obs, zero, zero, zero)
+        capacity = -(-config.replay_capacity // self.num_envs) * self.num_envs
         return Training(
             networks=Networks(actor, critic, actor, critic),
-            actor_optimiser=optax.scale_by_adam().init(actor),
-            critic_optimiser=optax.scale_by_adam().init(critic),
-            replay=Replay.create(example, capacity),
+            actor_optimizer=optax.scale_by_adam().init(actor),
+            critic_optimizer=optax.scale_by_adam().init(critic),
+            replay=Replay.create(example, capacity, self.num_envs),
             env=env,
             key=key,
             steps=count,
             updates=count,
         )
 
-    def view(self, config: DDPGConfig, obs: Observation, action: jax.Array) -> jax.Array:
+    def critic_input(self, config: DDPGConfig, obs: Observation, action: jax.Array) -> jax.Array:
         """What the critic sees of one observation and one action."""
-        if config.critic_view == "outcome" and self.goal_env is not None:
-            return self.goal_env.outcome(obs, action)
+        if config.critic_input == "outcome" and self.forward_model is not None:
+            return self.forward_model.critic_input(obs, action)
         return jnp.concatenate([obs["privileged_state"], action])
 
-    def views(self, config: DDPGConfig, batch: Transition) -> jax.Array:
+    def critic_inputs(self, config: DDPGConfig, batch: Transition) -> jax.Array:
         """What the critic sees of transitions with any leading axes."""
-        view = partial(self.view, config)
+        one = partial(self.critic_input, config)
         for _ in batch.reward.shape:
-            view = jax.vmap(view)
-        return view(batch.obs, batch.action)
+            one = jax.vmap(one)
+        return one(batch.obs, batch.action)
 
     def candidates(self, actor: Params, obs: Observation) -> jax.Array:
         """The actor's candidate actions for a batch of observations, (batch, heads, action_size)."""
@@ -173,9 +179,9 @@ class DDPG:
 
     def value(self, config: DDPGConfig, critic: Params, obs: Observation, actions: jax.Array) -> jax.Array:
         """Q for a batch of observations and their candidate actions: (batch, heads, action_size) to (batch, heads)."""
-        each_head = jax.vmap(self.view, in_axes=(None, None, 0))
-        views = jax.vmap(each_head, in_axes=(None, 0, 0))(config, obs, actions)
-        return jnp.asarray(self.critic.apply(critic, views))
+        each_head = jax.vmap(self.critic_input, in_axes=(None, None, 0))
+        inputs = jax.vmap(each_head, in_axes=(None, 0, 0))(config, obs, actions)
+        return jnp.asarray(self.critic.apply(critic, inputs))
 
     def act(self, config: DDPGConfig, actor: Params, critic: Params, obs: Observation) -> tuple[jax.Array, jax.Array]:
         """The policy: the candidate that the critic prefers, and its value; (batch, action_size) and (batch,)."""
@@ -213,7 +219,7 @@ class DDPG:
         noise = config.noise + (config.final_noise - config.noise) * progress
         action, _ = self.act(config, networks.actor, networks.critic, obs)
         action = jnp.clip(action + noise * jax.random.normal(noise_key, action.shape), -1, 1)
-        random = jax.random.bernoulli(which_key, config.random * (1 - progress), (self.num_envs, 1))
+        random = jax.random.bernoulli(which_key, config.random_action_prob * (1 - progress), (self.num_envs, 1))
         action = jnp.where(random, jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0), action)
         env = self.vector.step(training.env, action)
         transition = Transition(
@@ -223,6 +229,7 @@ class DDPG:
             next_obs=env.info["next_obs"],
             terminal=env.done * (1 - env.info["truncation"]),
             weight=1 - env.info["nonfinite"],
+            step=training.env.info["steps"].astype(jnp.float32),
         )
         metrics = {
             **{name: value.mean() for name, value in env.metrics.items()},
@@ -237,59 +244,66 @@ class DDPG:
         """Lines 10 to 15, `updates_per_step` times."""
         key, sample_key, relabel_key = jax.random.split(training.key, 3)
         shape = (config.updates_per_step, config.batch_size)
-        batches = self.relabel(config, training.replay, training.replay.sample(sample_key, shape), relabel_key)
-        views = self.views(config, batches)
-        training, metrics = jax.lax.scan(lambda t, x: self.update(config, t, *x), training, (batches, views))
+        rows = training.replay.sample(sample_key, shape)
+        batches = self.relabel(config, training.replay, rows, relabel_key)
+        inputs = self.critic_inputs(config, batches)
+        training, metrics = jax.lax.scan(lambda t, x: self.update(config, t, *x), training, (batches, inputs))
         return training.replace(key=key), jax.tree.map(jnp.mean, metrics)
 
-    def relabel(self, config: DDPGConfig, replay: Replay, batch: Transition, key: jax.Array) -> Transition:
-        """Hindsight: exchange the goals of a share of transitions (any leading axes) for points reached elsewhere in
-        the buffer. The reward for any goal is known, so this is exact."""
-        env = self.goal_env
+    def relabel(self, config: DDPGConfig, replay: Replay, rows: jax.Array, key: jax.Array) -> Transition:
+        """The transitions in rows of the buffer (any leading axes), the goals of a share of them exchanged for what
+        others reached (Andrychowicz et al. 2017, hindsight experience replay). The reward for any goal is known, and
+        whether it ends the episode, so this is exact."""
+        env, batch = self.goal_env, replay.read(rows)
         if env is None:
             return batch
         shape = batch.reward.shape
         choice_key, goal_key = jax.random.split(key)
-        chosen = jax.random.uniform(choice_key, shape) < config.relabel
-        donors = replay.sample(goal_key, shape).next_obs
+        chosen = jax.random.uniform(choice_key, shape) < config.her_ratio
+        if config.her_goals == "buffer":
+            donors = replay.sample(goal_key, shape)
+        else:
+            donors = replay.later(goal_key, rows, self.episode_length)
 
         def one(transition: Transition, donor: Observation, chosen: jax.Array) -> Transition:
             goal = env.achieved(donor)
+            reward, terminal = env.goal_reward(env.achieved(transition.next_obs), goal, transition.action)
             changed = transition.replace(
-                obs=env.relabel(transition.obs, goal),
-                next_obs=env.relabel(transition.next_obs, goal),
-                reward=env.goal_reward(env.achieved(transition.next_obs), goal),
+                obs=env.replace_goal(transition.obs, goal),
+                next_obs=env.replace_goal(transition.next_obs, goal),
+                reward=reward,
+                terminal=terminal,
             )
             return jax.tree.map(lambda new, old: jnp.where(chosen, new, old), changed, transition)
 
         for _ in shape:
             one = jax.vmap(one)
-        return one(batch, donors, chosen)
+        return one(batch, replay.read(donors).next_obs, chosen)
 
     def update(
-        self, config: DDPGConfig, training: Training, batch: Transition, view: jax.Array
+        self, config: DDPGConfig, training: Training, batch: Transition, critic_input: jax.Array
     ) -> tuple[Training, Metrics]:
-        """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau. `view` is what the
-        critic sees of the batch's observations and actions, (batch, view)."""
+        """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau. `critic_input` is what
+        the critic sees of the batch's observations and actions, (batch, size)."""
         networks = training.networks
         target = batch.reward + jax.lax.cond(
             config.discount > 0, lambda: self._bootstrap(config, networks, batch), lambda: jnp.zeros_like(batch.reward)
         )
 
         def critic_loss(critic: Params) -> tuple[jax.Array, jax.Array]:
-            q = jnp.asarray(self.critic.apply(critic, view))
-            return losses.critic_loss(q, target, batch.weight, config.critic_focus), q.mean()
+            q = jnp.asarray(self.critic.apply(critic, critic_input))
+            return losses.critic_loss(q, target, batch.weight, config.critic_error_weight), q.mean()
 
         def actor_loss(actor: Params) -> jax.Array:
             q = self.value(config, critic, batch.obs, self.candidates(actor, batch.obs))
-            return losses.actor_loss(q, batch.weight, config.temperature)
+            return losses.actor_loss(q, batch.weight, config.head_temperature)
 
         rate = config.final_lr + (1 - config.final_lr) * (1 + jnp.cos(jnp.pi * self._progress(training))) / 2
         (loss, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(networks.critic)
         adam = optax.scale_by_adam(b2=config.adam_b2)
-        step, critic_optimiser = adam.update(gradient, training.critic_optimiser)
+        step, critic_optimizer = adam.update(gradient, training.critic_optimizer)
         critic = optax.tree.add_scale(networks.critic, -rate * config.critic_lr, step)
-        step, actor_optimiser = adam.update(jax.grad(actor_loss)(networks.actor), training.actor_optimiser)
+        step, actor_optimizer = adam.update(jax.grad(actor_loss)(networks.actor), training.actor_optimizer)
         actor = optax.tree.add_scale(networks.actor, -rate * config.actor_lr, step)
         networks = Networks(
             actor=actor,
@@ -299,8 +313,8 @@ class DDPG:
         )
         training = training.replace(
             networks=networks,
-            actor_optimiser=actor_optimiser,
-            critic_optimiser=critic_optimiser,
+            actor_optimizer=actor_optimizer,
+            critic_optimizer=critic_optimizer,
             updates=training.updates + 1,
         )
         return training, {"critic_loss": loss, "q": q}

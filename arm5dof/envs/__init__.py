@@ -1,7 +1,7 @@
-"""Environments: pure, single, batched with `jax.vmap`."""
+"""Environments: pure, single, batched with `jax.vmap`. A task is one file here, or a class of the user's own."""
 
-from arm5dof.envs.base import Env, GoalEnv, State
+from arm5dof.envs.base import Env, ForwardModel, GoalEnv, State, Task
 from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.envs.vector import VectorEnv
 
-__all__ = ["Env", "GoalEnv", "Reach", "ReachConfig", "State", "VectorEnv"]
+__all__ = ["Env", "ForwardModel", "GoalEnv", "Reach", "ReachConfig", "State", "Task", "VectorEnv"]

@@ -1,18 +1,36 @@
-"""What an environment is: `State` and the protocols that trainers know."""
+"""What a task is: `State` and the protocols by which trainers, runs and commands know it.
+
+`Env` can be simulated, which is all that the agent needs. `Task` can be configured, measured and kept in a run's
+folder. `GoalEnv` has goals that can be exchanged in hindsight, and `ForwardModel` tells where an action leads, so that
+a policy can be asked for the action that leads to a goal: inverse kinematics.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 from flax import struct
+
+from arm5dof.envs.metrics import Error, Metric, Score
+
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
 
 Observation = dict[str, jax.Array]
 """`state` is what the actor sees, `privileged_state` what the critic sees besides the action; both are vectors."""
 
+Goal = Any
+"""A pytree of arrays."""
+
 
 class State(struct.PyTreeNode):
-    """One environment's state, with the fields that MuJoCo Playground uses."""
+    """One environment's state, with the fields that MuJoCo Playground and Brax use."""
 
     data: Any
     obs: Observation
@@ -23,6 +41,20 @@ class State(struct.PyTreeNode):
     info: dict[str, Any]
 
 
+class Act(Protocol):
+    """A policy as tasks see it."""
+
+    def __call__(self, obs: Observation, branch: jax.Array | None = None) -> jax.Array:
+        """Actions (n, action_size) for a batch of observations, of given branches (n,) if there are any."""
+        ...
+
+    def branch(self, obs: Observation) -> jax.Array:
+        """Which of its candidate answers the policy prefers for a batch of observations, (n,) int32. Kept from call to
+        call, it keeps a motion on one branch of solutions."""
+        ...
+
+
+@runtime_checkable
 class Env(Protocol):
     """A pure environment without a batch axis. Actions are vectors in [-1, 1].
 
@@ -37,31 +69,150 @@ class Env(Protocol):
     def step(self, state: State, action: jax.Array) -> State: ...
 
 
-@runtime_checkable
-class GoalEnv(Protocol):
-    """An environment whose reward depends on a goal, a point, in a known way, so that goals can be exchanged in
-    hindsight and the outcome of an action foreseen. Vectors without a batch axis, as everywhere. The goal of an
-    episode, (3,) metres, is kept in `info["goal"]`."""
+class Task(ABC):
+    """An environment that can be trained from a TOML file. Inherit from it, and write `Config` (a class decorated with
+    `arm5dof.settings.settings`), `action_size`, `reset` and `step` as `Env` has them; the rest has defaults."""
+
+    Config: ClassVar[type]
+    """The task's settings, the section `[env]` of a TOML file. One of them is `episode_length`."""
+    metrics: ClassVar[Mapping[str, Metric]] = MappingProxyType({"return": Score()})
+    """How people read what `evaluate` and `watch` return, by name."""
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
 
     @property
+    @abstractmethod
     def action_size(self) -> int: ...
 
+    @abstractmethod
     def reset(self, key: jax.Array) -> State: ...
 
+    @abstractmethod
     def step(self, state: State, action: jax.Array) -> State: ...
 
-    def achieved(self, obs: Observation) -> jax.Array:
-        """The point that this observation has reached, (3,) metres."""
+    @property
+    def mj_model(self) -> mujoco.MjModel | None:
+        """The MuJoCo model that a run is to keep, so that it answers for the same robot anywhere; None without one. A
+        task that has one takes it as its second argument."""
+        return None
+
+    @property
+    def mj_spec(self) -> mujoco.MjSpec | None:
+        """What that was compiled from, if it is at hand."""
+        return None
+
+    @property
+    def headline(self) -> str:
+        """By which of `metrics` a run is judged."""
+        return "return"
+
+    @property
+    def episode_length(self) -> int:
+        """Steps after which an episode is cut off, a truncation."""
+        return int(self.config.episode_length)
+
+    def check(self) -> None:  # noqa: B027
+        """Raise `UserError` if the environment cannot be simulated."""
+
+    @property
+    def fingerprint(self) -> tuple[object, ...] | None:
+        """All that the environment's functions depend on but this package's source, so that its compiled programs can
+        be found again; None if that is not known."""
+        return None
+
+    def evaluate(self, act: Act, key: jax.Array, n: int) -> dict[str, jax.Array]:
+        """Measure a policy on `n` episodes, or whatever the task is judged by: (n,) arrays by name, in SI units. Called
+        inside `jax.jit`."""
+        return {"return": episode_returns(self, act, key, n)}
+
+    def watch(self, act: Act, key: jax.Array) -> dict[str, jax.Array]:
+        """Numbers () to watch after every epoch, cheap to compute. Called inside `jax.jit`."""
+        return {}
+
+
+@runtime_checkable
+class GoalEnv(Env, Protocol):
+    """An environment whose reward depends on a goal in a known way, so that goals can be exchanged in hindsight.
+    Without a batch axis, as everywhere. The goal of an episode is kept in `info["goal"]`."""
+
+    def achieved(self, obs: Observation) -> Goal:
+        """The goal that this observation has reached."""
         ...
 
-    def relabel(self, obs: Observation, goal: jax.Array) -> Observation:
+    def replace_goal(self, obs: Observation, goal: Goal) -> Observation:
         """The same observation, had the goal been another."""
         ...
 
-    def goal_reward(self, achieved: jax.Array, goal: jax.Array) -> jax.Array:
-        """The reward for having reached a point when `goal` was asked for."""
+    def goal_reward(self, achieved: Goal, goal: Goal, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The reward for having reached one goal by an action when another was asked for, and 1.0 if that ends the
+        episode for good, else 0.0. `step` says the same."""
         ...
 
-    def outcome(self, obs: Observation, action: jax.Array) -> jax.Array:
-        """What the critic is shown of an action: where it leads by the robot's own model, beside the goal."""
+
+@runtime_checkable
+class ForwardModel(GoalEnv, Protocol):
+    """A goal environment that knows where an action leads, by the robot's own model."""
+
+    @property
+    def goal_inputs(self) -> Mapping[str, tuple[str, ...]]:
+        """How people state a goal: names of vectors (options of `arm5dof solve`, arguments of `Policy.solve`), and the
+        names of each one's components (columns of a CSV)."""
         ...
+
+    @property
+    def components(self) -> Mapping[str, Error]:
+        """What `errors` returns, and how people read it."""
+        ...
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joint positions that answer a goal."""
+        ...
+
+    @property
+    def workspace(self) -> str:
+        """What can be reached, in words."""
+        ...
+
+    def goals(self, **inputs: np.ndarray) -> Goal:
+        """Goals with a leading axis (n,) from what people state, arrays (n, k) by the names of `goal_inputs`. Raises
+        `UserError` for what is no goal."""
+        ...
+
+    def question(self, goal: Goal) -> Observation:
+        """The observation by which a policy is asked for an action that leads to a goal."""
+        ...
+
+    def outcome(self, action: jax.Array) -> Goal:
+        """Where an action leads."""
+        ...
+
+    def joints(self, action: jax.Array) -> jax.Array:
+        """The joint positions that an action asks for, (dof,)."""
+        ...
+
+    def errors(self, achieved: Goal, goal: Goal) -> dict[str, jax.Array]:
+        """How far one goal is from another, by component: () each, metres or radians."""
+        ...
+
+    def correct(self, asked: Goal, achieved: Goal, goal: Goal) -> Goal:
+        """What to ask for next, if asking for `asked` achieved `achieved` where `goal` was wanted."""
+        ...
+
+    def critic_input(self, obs: Observation, action: jax.Array) -> jax.Array:
+        """What the critic is shown of an action: where it leads, beside the goal; a vector."""
+        ...
+
+
+def episode_returns(env: Task, act: Act, key: jax.Array, n: int) -> jax.Array:
+    """Undiscounted returns, (n,), of `n` episodes from `env.reset`."""
+    state = jax.vmap(env.reset)(jax.random.split(key, n))
+
+    def step(carry: tuple[State, jax.Array, jax.Array], _: None) -> tuple[tuple[State, jax.Array, jax.Array], None]:
+        state, total, alive = carry
+        state = jax.vmap(env.step)(state, act(state.obs))
+        return (state, total + alive * state.reward, alive * (1 - state.done)), None
+
+    (_, total, _), _ = jax.lax.scan(step, (state, jnp.zeros(n), jnp.ones(n)), None, env.episode_length)
+    return total

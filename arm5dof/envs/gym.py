@@ -11,6 +11,7 @@ from typing import Any, Literal, cast, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from arm5dof.envs.base import Env, GoalEnv, Observation, State
 from arm5dof.envs.vector import VectorEnv
@@ -27,8 +28,8 @@ except ImportError as error:
 Infos = dict[str, Any]
 Shown = Literal["state", "dict", "goal"]
 """What is shown of an observation, float32 throughout. state: the actor's vector, (size,). dict: that and the critic's
-`privileged_state`. goal: `observation`, `achieved_goal` and `desired_goal`, for replay in hindsight; the goals are
-points, (3,) metres, and `observation` is the actor's vector as it were with the goal at the world's origin."""
+`privileged_state`. goal: `observation`, `achieved_goal` and `desired_goal`, for replay in hindsight; a goal is one
+vector, whatever its parts, and `observation` is the actor's vector as it were with a goal of zeros."""
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv):
@@ -105,8 +106,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         """What is shown of `obs`; the goal is the one that `state` holds."""
         if self._shown == "goal":
             env, goal = self._goal_env, state.info["goal"]
-            without = jax.vmap(env.relabel)(obs, jnp.zeros_like(goal))["state"]
-            return {"observation": without, "achieved_goal": jax.vmap(env.achieved)(obs), "desired_goal": goal}
+            without = jax.vmap(env.replace_goal)(obs, jax.tree.map(jnp.zeros_like, goal))["state"]
+            achieved = jax.vmap(env.achieved)(obs)
+            return {"observation": without, "achieved_goal": _vectors(achieved), "desired_goal": _vectors(goal)}
         return obs["state"] if self._shown == "state" else obs
 
 
@@ -139,8 +141,16 @@ class GymGoalEnv(GymEnv):
     `compute_reward` of what it shows, to the last bit."""
 
     def __init__(self, env: GoalEnv, episode_length: int) -> None:
+        """Raises `UserError` if the rewards depend on the action, which replay in hindsight does not tell."""
         super().__init__(env, episode_length, "goal")
-        self._rewards = jax.jit(jnp.vectorize(env.goal_reward, signature="(n),(n)->()"))
+        goal = jax.eval_shape(lambda key: env.reset(key).info["goal"], jax.random.key(0))
+        action = jnp.zeros(env.action_size)
+        traced = jax.make_jaxpr(env.goal_reward)(goal, goal, action).jaxpr
+        if any(traced.invars[-1] in equation.invars for equation in traced.eqns):
+            raise UserError(f"the rewards of {type(env).__name__} depend on the action: replay in hindsight lacks it")
+        _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), goal))
+        reward = lambda achieved, wanted: env.goal_reward(unravel(achieved), unravel(wanted), action)[0]
+        self._rewards = jax.jit(jnp.vectorize(reward, signature="(n),(n)->()"))
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Infos]:
         """As in `GymEnv.step`."""
@@ -150,8 +160,13 @@ class GymGoalEnv(GymEnv):
         return obs, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
-        """The rewards, (...) float32, for having reached points (..., 3) where others were asked for, in metres."""
+        """The rewards, (...) float32, for having reached goals (..., size) where others were asked for."""
         return np.array(self._rewards(np.asarray(achieved_goal, np.float32), np.asarray(desired_goal, np.float32)))[()]
+
+
+def _vectors(goals: Any) -> jax.Array:
+    """Goals with a leading axis, each as one vector."""
+    return jax.vmap(lambda goal: ravel_pytree(goal)[0])(goals)
 
 
 def _infos(state: State) -> dict[str, jax.Array]:

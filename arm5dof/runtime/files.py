@@ -7,26 +7,40 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
 
 from arm5dof.errors import UserError
 
-PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(str(resources.files("arm5dof")))
 
 
 def find(folder: str, name: str | Path) -> Path | None:
     """A file the user named, or one of that name in a shipped folder (`mjcf`, `experiments`); None if neither is.
 
-    An installed wheel carries those folders inside the package, a checkout beside it.
+    Raises `UserError` where a bare name means either of two that differ.
     """
-    candidates = [Path(name), PACKAGE / folder / name, PACKAGE.parent / folder / name]
-    return next((path for path in candidates if path.is_file()), None)
+    own, ours = Path(name), shipped_file(folder, name)
+    if not own.is_file():
+        return ours
+    if ours is not None and name == own.name and own.read_bytes() != ours.read_bytes():
+        raise UserError(f"{name} is a file here and one that ships, and they differ: for the one here say ./{name}")
+    return own
+
+
+def shipped_file(folder: str, name: str | Path) -> Path | None:
+    """The file of that name in a shipped folder, or None."""
+    return next((root / name for root in _roots(folder) if (root / name).is_file()), None)
 
 
 def shipped(folder: str, suffix: str) -> list[str]:
     """Names of the files that ship in a folder, for error messages and help."""
-    roots = (PACKAGE / folder, PACKAGE.parent / folder)
-    return sorted({path.name for root in roots if root.is_dir() for path in root.glob(f"*{suffix}")})
+    return sorted({path.name for root in _roots(folder) if root.is_dir() for path in root.glob(f"*{suffix}")})
+
+
+def _roots(folder: str) -> tuple[Path, Path]:
+    """An installed wheel carries the folders inside the package, a checkout beside it."""
+    return PACKAGE / folder, PACKAGE.parent / folder
 
 
 @contextmanager

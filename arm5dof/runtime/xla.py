@@ -55,7 +55,7 @@ def fusion_emitters() -> dict[str, bool]:
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def gc_paused() -> Iterator[None]:
     """Tracing makes many objects that stay: to search them for garbage again and again takes much of its time."""
     was = gc.isenabled()
     gc.disable()

@@ -1,17 +1,18 @@
 """Checkpoints with orbax: complete, atomic, verified when read.
 
-A checkpoint has two items, `networks` (all that answering needs) and `training` (optimisers, replay buffer,
+A checkpoint has two items, `networks` (all that answering needs) and `training` (optimizers, replay buffer,
 environments, random keys, counters), and a record of names, shapes and digests by which damage and foreign
-checkpoints are recognised. Nothing in it is ever unpickled.
+checkpoints are recognised, and of the settings that made it. Nothing in it is ever unpickled.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,13 +30,15 @@ KEEP = 2
 class Checkpoints:
     """The checkpoints of one run, in one folder, numbered by the steps taken.
 
-    Only the process that trains the run may open them for writing: it clears away what a killed one left unfinished.
+    `settings` are those that shape what is kept, by name: a checkpoint made with others is refused. Only the process
+    that trains the run may open them for writing: it clears away what a killed one left unfinished.
     """
 
-    def __init__(self, folder: Path, read_only: bool = False) -> None:
+    def __init__(self, folder: Path, settings: Mapping[str, Any], read_only: bool = False) -> None:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
         self.folder = folder
+        self._settings = dict(settings)
         logging.getLogger("absl").setLevel(logging.CRITICAL)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=KEEP,
@@ -57,8 +60,8 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
-        record = {name: _describe(leaves) for name, leaves in items.items()}
-        failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, go on with --resume"
+        record = {**{name: _describe(leaves) for name, leaves in items.items()}, "settings": self._settings}
+        failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, resume from that"
         with _as_user_error(failure):
             self._manager.save(
                 int(training.steps),
@@ -88,7 +91,9 @@ class Checkpoints:
         template = {name: _storable(leaf) for name, leaf in _named(like).items() if leaf.size}
         abstract = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in template.items()}
         with _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one"):
-            record = self._manager.restore(step, args=ocp.args.Composite(record=ocp.args.JsonRestore())).record[item]
+            records = self._manager.restore(step, args=ocp.args.Composite(record=ocp.args.JsonRestore())).record
+            self._check(where, records.get("settings"))
+            record = records[item]
             expected = {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in abstract.items()}
             if expected != record["leaves"]:
                 raise UserError(
@@ -100,6 +105,17 @@ class Checkpoints:
             if _describe(restored)["sha256"] != record["sha256"]:
                 raise ValueError("its contents do not match their digest")
         return _rebuild(like, restored)
+
+    def _check(self, where: Path, made_with: Mapping[str, Any] | None) -> None:
+        """Raise `UserError` if a checkpoint was made with other settings."""
+        if made_with is None:
+            raise UserError(f"the checkpoint {where} is of an older version: train the run anew")
+        names = [*made_with, *(name for name in self._settings if name not in made_with)]
+        if changed := [name for name in names if made_with.get(name) != self._settings.get(name)]:
+            told = "; ".join(f"{n} = {made_with.get(n)!r}, now {self._settings.get(n)!r}" for n in changed[:3])
+            raise UserError(
+                f"the checkpoint {where} was made with other settings ({told}): set them back in config.toml"
+            )
 
 
 def _named(tree: Any) -> dict[str, Any]:
@@ -146,12 +162,9 @@ def _describe(leaves: dict[str, Any]) -> dict[str, Any]:
 def _as_user_error(message: str) -> Iterator[None]:
     """Orbax and tensorstore raise many types for a bad file or a full disk; to the user they are one.
 
-    After one failure the rest of tensorstore's threads fail too, each with a traceback: about its closed event loop, or
-    by asyncio because nobody waits for it any more.
+    After one failure the rest of tensorstore's threads fail too: see `silence_abandoned_writes`.
     """
-    report, asyncio = sys.unraisablehook, logging.getLogger("asyncio")
-    sys.unraisablehook = lambda failure: None if "loop is closed" in str(failure.exc_value) else report(failure)
-    asyncio.addFilter(_is_awaited)
+    undo = silence_abandoned_writes()
     try:
         yield
     except UserError:
@@ -159,10 +172,26 @@ def _as_user_error(message: str) -> Iterator[None]:
     except Exception as error:
         reason = (str(error) or type(error).__name__).strip().splitlines()[0].split(" [source")[0]
         reason = reason if len(reason) < 160 else "..." + reason[-160:]
+        error.with_traceback(None)  # Its frames hold what is to be collected.
+        gc.collect()
         raise UserError(f"{message} ({reason})") from error
-    else:
+    finally:
+        undo()
+
+
+def silence_abandoned_writes() -> Callable[[], None]:
+    """Keep quiet what tensorstore's threads say when one of them has failed: each a traceback, about its closed event
+    loop, or by asyncio because nobody waits for it any more. Returns what undoes it; a process that ends with such a
+    failure leaves it, since some of them fail as late as that."""
+    report, asyncio = sys.unraisablehook, logging.getLogger("asyncio")
+    sys.unraisablehook = lambda failure: None if "loop is closed" in str(failure.exc_value) else report(failure)
+    asyncio.addFilter(_is_awaited)
+
+    def undo() -> None:
         sys.unraisablehook = report
         asyncio.removeFilter(_is_awaited)
+
+    return undo
 
 
 def _is_awaited(record: logging.LogRecord) -> bool:

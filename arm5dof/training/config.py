@@ -2,34 +2,66 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
-import json
+import importlib
+import importlib.util
+import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mujoco
 import tomli_w
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from arm5dof.ddpg import DDPGConfig
-from arm5dof.envs import ReachConfig
+from arm5dof.envs import Task
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
-from arm5dof.settings import settings
 from arm5dof.training.evaluate import EvaluateConfig
 from arm5dof.training.trainer import TrainConfig
 
 
-@settings
+@dataclass(frozen=True)
 class Config:
-    """A run: the task, the agent, the budget and the accuracy protocol."""
+    """A run: the task and its settings, the agent, the budget and the accuracy protocol."""
 
-    env: ReachConfig = ReachConfig()
-    ddpg: DDPGConfig = DDPGConfig()
-    train: TrainConfig = TrainConfig()
-    evaluate: EvaluateConfig = EvaluateConfig()
+    task: str
+    """The name of a task that ships, or `package.module:Class`."""
+    env: Any
+    ddpg: DDPGConfig
+    train: TrainConfig
+    evaluate: EvaluateConfig
+
+    def flat(self) -> dict[str, Any]:
+        """Every setting by its full name, such as `ddpg.batch_size`."""
+        return {
+            "env.task": self.task,
+            **{
+                f"{section}.{f.name}": getattr(getattr(self, section), f.name)
+                for section in SECTIONS
+                for f in dataclasses.fields(getattr(self, section))
+            },
+        }
+
+
+SECTIONS = ("env", "ddpg", "train", "evaluate")
+
+
+def fixed(config: Config) -> dict[str, Any]:
+    """The settings that shape a run's networks and what they have learnt, by full name: all but those that may change
+    before it is resumed."""
+    may = [
+        f"{section}.{f.name}"
+        for section in SECTIONS
+        for f in dataclasses.fields(getattr(config, section))
+        if f.metadata.get("may_change")
+    ]
+    return {name: value for name, value in config.flat().items() if name not in may}
 
 
 class Field(NamedTuple):
@@ -42,84 +74,218 @@ class Field(NamedTuple):
     choices: list[str] | None
 
 
-ADAPTER = TypeAdapter(Config)
+def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> Config:
+    """Read an experiment and override its settings.
 
+    What a file leaves open is as in the TOML file of its task, `NAME.toml` for a task that ships.
 
-def fields() -> Iterator[Field]:
-    """Every setting with its documentation, in the order of declaration. Names are unique across sections."""
-    schema = ADAPTER.json_schema()
-    for section, reference in schema["properties"].items():
-        name = (reference.get("$ref") or reference["allOf"][0]["$ref"]).rsplit("/", 1)[-1]
-        for key, value in schema["$defs"][name]["properties"].items():
-            yield Field(section, key, value["default"], " ".join(value["description"].split()), value.get("enum"))
+    Args:
+        experiment: A TOML file, or the name of one that ships.
+        overrides: Values by name: `batch_size=128`, or with its section where a name is not unique:
+            `**{"ddpg.batch_size": 128}`. Text is read as on a command line.
 
+    Raises:
+        UserError: There is no such file or setting, or a value is not of its type and range.
 
-def build(values: Mapping[str, Any], source: str) -> Config:
-    """Validate nested settings. Raises `UserError` naming the first fault, and the nearest valid name for a bad key."""
-    try:
-        return ADAPTER.validate_json(json.dumps(values))
-    except ValidationError as error:
-        raise UserError(f"{source}: {_explain(error.errors()[0])}") from None
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{source}: {error}") from None
-
-
-def load(experiment: str | Path, overrides: Mapping[str, str] | None = None) -> Config:
-    """Read an experiment (a path, or the name of one that ships) and override fields, given as text by name.
-
-    A name may be `batch_size`, `batch-size` or `ddpg.batch_size`. Raises `UserError` on anything amiss.
+    >>> from arm5dof import load_config
+    >>> config = load_config("kinematic.toml", episodes=100)
+    >>> config.train.episodes, config.env.dynamics
+    (100, 'kinematic')
+    >>> load_config(batch_sise=3)
+    Traceback (most recent call last):
+    arm5dof.errors.UserError: unknown setting 'batch_sise': did you mean 'batch_size'?
     """
     path = files.find("experiments", experiment)
     if path is None:
-        known = ", ".join(files.shipped("experiments", ".toml"))
-        raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {known}")
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path} is not valid TOML: {error}") from None
+        names = ", ".join(files.shipped("experiments", ".toml"))
+        raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
+    values = _read(path)
+    config = build(values, str(path), path.parent)  # A fault of the file is not to be blamed on the overrides.
     if not overrides:
-        return build(values, str(path))
-    build(values, str(path))  # So that a fault of the file is not blamed on the command line.
-    for name, text in overrides.items():
-        known_field = find(name)
-        values.setdefault(known_field.section, {})[known_field.name] = _parse(text, known_field.default)
-    return build(values, "command line")
+        return config
+    known = fields(config.task)
+    for name, value in overrides.items():
+        found = find(name, known)
+        values.setdefault(found.section, {})[found.name] = _parse(value, found.default)
+    return build(values, "", path.parent)
 
 
-def find(name: str) -> Field:
-    """The setting of that name. Raises `UserError` naming the nearest one if there is none."""
-    wanted = name.replace("-", "_")
-    known = {key: f for f in fields() for key in (f.name, f"{f.section}.{f.name}")}
-    if wanted not in known:
-        near = difflib.get_close_matches(wanted, known, n=1)
-        hint = f"did you mean --{near[0].replace('_', '-')}?" if near else "see arm5dof train --help"
-        raise UserError(f"unknown option --{name}: {hint}")
-    return known[wanted]
+def build(values: Mapping[str, Any], source: str = "", folder: Path | None = None) -> Config:
+    """A configuration from nested settings, as TOML has them.
+
+    Args:
+        values: Settings by section and name; `values["env"]["task"]` is the task.
+        source: Where they are from, for errors.
+        folder: Where a user's own task may be imported from, besides the usual places.
+
+    Raises:
+        UserError: The first fault, and for an unknown key the nearest valid one.
+    """
+    try:
+        for section, given in values.items():
+            if section not in SECTIONS:
+                raise UserError(f"unknown section {section!r}: {nearest_hint(section, SECTIONS)}")
+            if not isinstance(given, Mapping):
+                raise UserError(f"{section} = {given!r}: it should be a section [{section}]")
+        task = values.get("env", {}).get("task", "reach")
+        classes = section_classes(task, folder)
+        merged = {section: {**_task_defaults(task).get(section, {}), **values.get(section, {})} for section in SECTIONS}
+        merged["env"].pop("task", None)
+        return Config(task, **{name: _section(name, classes[name], merged[name]) for name in SECTIONS})
+    except UserError as error:
+        raise UserError(f"{source}: {error}" if source else str(error)) from None
 
 
 def dumps(config: Config) -> str:
     """The configuration as TOML, every field spelled out."""
-    return tomli_w.dumps(dataclasses.asdict(config))
+    sections = {name: dataclasses.asdict(getattr(config, name)) for name in SECTIONS}
+    return tomli_w.dumps({**sections, "env": {"task": config.task, **sections["env"]}})
 
 
-def _parse(text: str, default: Any) -> Any:
-    """A command line's text as the TOML value it spells; strings need no quotes there."""
-    if isinstance(default, str):
-        return text
+def section_classes(task: str, folder: Path | None = None) -> dict[str, type]:
+    """The classes of a configuration's sections."""
+    own = task_class(task, folder).Config
+    return {"env": own, "ddpg": DDPGConfig, "train": TrainConfig, "evaluate": EvaluateConfig}
+
+
+def task_class(task: str, folder: Path | None = None) -> type[Task]:
+    """The class of a task: for `reach_pose` `ReachPose` of `arm5dof.envs.reach_pose`, or a user's `module:Class`.
+
+    Raises:
+        UserError: There is none of that name, or it is no task.
+    """
+    module, _, name = task.partition(":") if isinstance(task, str) else ("", "", "")
+    shipped = not name
+    if shipped:
+        name = "".join(word.capitalize() for word in module.split("_"))
+        if not module.isidentifier() or importlib.util.find_spec(f"arm5dof.envs.{module}") is None:
+            raise UserError(
+                f"no task {task!r}: it is one of those shipped ({', '.join(shipped_tasks())}), or package.module:Class"
+            )
+        module = f"arm5dof.envs.{module}"
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+        found: Any = getattr(_import(module, folder), name, None)
+    except Exception as error:  # The user's own code, which may raise anything.
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(
+            f"cannot import task {task!r} ({reason}): put its folder on PYTHONPATH, or start from there"
+        ) from error
+    is_task = isinstance(found, type) and issubclass(found, Task)
+    if not is_task or not dataclasses.is_dataclass(getattr(found, "Config", None)):
+        raise UserError(f"{task!r} is no task: it takes a class that inherits from arm5dof.Task and has a Config")
+    return found
 
 
-def _explain(fault: Any) -> str:
-    path = [str(part) for part in fault["loc"]]
-    where = ".".join(path)
-    if fault["type"] == "unexpected_keyword_argument":
-        table: dict[str, list[str]] = {}
-        for f in fields():
-            table.setdefault(f.section, []).append(f.name)
-        valid = list(table) if len(path) == 1 else table[path[0]]
-        near = difflib.get_close_matches(path[-1], valid, n=1)
-        return f"unknown key {where!r}: " + (f"did you mean {near[0]!r}?" if near else f"valid are {', '.join(valid)}")
-    return f"{where} = {fault['input']!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+def shipped_tasks() -> list[str]:
+    """Names of the tasks that ship: those with a module and a TOML file of the same name."""
+    names = [name.removesuffix(".toml") for name in files.shipped("experiments", ".toml")]
+    return [name for name in names if importlib.util.find_spec(f"arm5dof.envs.{name}")]
+
+
+def make_env(config: Config, mj_model: mujoco.MjModel | None = None) -> Task:
+    """The environment that a configuration describes.
+
+    Args:
+        config: The configuration.
+        mj_model: The compiled model to use instead of the file that the task's settings name.
+
+    Raises:
+        UserError: The task cannot be made from these settings.
+
+    >>> from arm5dof import load_config, make_env
+    >>> make_env(load_config("kinematic.toml")).action_size
+    5
+    """
+    cls: Any = task_class(config.task)
+    return cls(config.env) if mj_model is None else cls(config.env, mj_model)
+
+
+def fields(task: str = "reach", folder: Path | None = None) -> list[Field]:
+    """Every setting with its documentation, in the order of declaration; defaults are the task's."""
+    defaults = build({"env": {"task": task}}, folder=folder)
+    return [
+        Field(section, name, getattr(getattr(defaults, section), name), *described)
+        for section, cls in section_classes(task, folder).items()
+        for name, described in _descriptions(cls).items()
+    ]
+
+
+def find(name: str, known: list[Field]) -> Field:
+    """The setting of a name, `batch_size` or `ddpg.batch_size`. Raises `UserError` naming the nearest one if there is
+    none, or the full names if there are several."""
+    wanted = name.replace("-", "_")
+    matching = [f for f in known if wanted in (f.name, f"{f.section}.{f.name}")]
+    if len(matching) > 1:
+        raise UserError(f"{name!r} is {' or '.join(f'{f.section}.{f.name}' for f in matching)}: name the section too")
+    if not matching:
+        names = [key for f in known for key in (f.name, f"{f.section}.{f.name}")]
+        raise UserError(f"unknown setting {name!r}: {nearest_hint(wanted, names, 'see arm5dof train --help')}")
+    return matching[0]
+
+
+def _section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
+    names = [f.name for f in dataclasses.fields(cls)]
+    for key in values:
+        if key not in names:
+            raise UserError(f"unknown key '{name}.{key}': {nearest_hint(key, names)}")
+    try:
+        return cls(**values)
+    except UserError as error:
+        raise UserError(f"{name}.{error}") from None
+
+
+def _task_defaults(task: str) -> dict[str, Any]:
+    """What the TOML file of a task that ships says."""
+    path = files.shipped_file("experiments", f"{task}.toml") if ":" not in task else None
+    return {} if path is None else _read(path)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path} is not valid TOML: {error}") from None
+
+
+def _import(module: str, folder: Path | None) -> Any:
+    """Import a module, if need be from `folder` or the working directory."""
+    for place in (folder, Path.cwd()):
+        if place is not None and str(place.resolve()) not in sys.path:
+            sys.path.append(str(place.resolve()))
+    importlib.invalidate_caches()
+    return importlib.import_module(module)
+
+
+def _descriptions(cls: type) -> dict[str, tuple[str, list[str] | None]]:
+    """What is said of each field, and its choices if it has some."""
+    described: dict[str, tuple[str, list[str] | None]] = {}
+    for base in reversed(cls.__mro__):  # A field is described where it is declared.
+        for name, schema in (
+            TypeAdapter(base).json_schema()["properties"] if "__pydantic_config__" in base.__dict__ else {}
+        ).items():
+            if "description" in schema or name not in described:
+                described[name] = " ".join(schema.get("description", "").split()), schema.get("enum")
+    return described
+
+
+def _parse(value: Any, default: Any) -> Any:
+    """A command line's text as the value that it spells; what is no text, or is to be some, stays."""
+    if not isinstance(value, str) or isinstance(default, str):
+        return value
+    if isinstance(default, bool):
+        return {"true": True, "false": False}.get(value.lower(), value)
+    for number in (int, float):
+        with contextlib.suppress(ValueError):
+            return number(value)
+    return value
+
+
+def nearest_hint(name: str, valid: Iterable[str], otherwise: str | None = None) -> str:
+    """What to say of a name that is none of the valid ones."""
+    near = nearest(name, valid)
+    return f"did you mean {near!r}?" if near else otherwise or f"valid are {', '.join(valid)}"
+
+
+def nearest(name: str, valid: Iterable[str]) -> str | None:
+    """The valid name that is most like another, if any is."""
+    return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)

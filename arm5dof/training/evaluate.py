@@ -1,135 +1,80 @@
-"""Accuracy, defined once.
-
-Targets are the forward kinematics of joint positions drawn uniformly inside the limits, from a stream of random
-numbers that training never touches. Three questions are asked of the same targets:
-
-- `one_shot`: how far from the target does one answer of the policy put the end effector, by forward kinematics?
-- `refined`: the same, the policy asked again with the target shifted by the error it made (`Policy.__call__`);
-- `episode`: how far is the end effector at the last step of an episode from a random pose, in the environment? The
-  policy is asked again here too, in the first steps, with the target shifted by the error that the arm then shows.
-"""
+"""Evaluation: a policy measured by its task, on a stream of random numbers that training never touches."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from annotated_types import Ge
 
-from arm5dof.ddpg import DDPG, DDPGConfig, Networks
-from arm5dof.envs import Reach, State
+from arm5dof.envs import Task
+from arm5dof.envs.metrics import Metric, Summary
+from arm5dof.runtime.tables import Table
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
 
-WITHIN_MM = (1, 5, 10, 20)
 CHUNK = 1000
-"""Targets in one device call: what the progress bar moves by, and no more memory than a training batch."""
+"""Samples in one device call: what the progress bar moves by, and no more memory than a training batch."""
 
 
 @settings
 class EvaluateConfig:
     """The accuracy protocol."""
 
-    targets: Annotated[int, Ge(1)] = static(default=10_000)
-    """Targets in the final evaluation."""
-    interim_targets: Annotated[int, Ge(1)] = static(default=2_000)
-    """Targets in the evaluations on the way."""
-    refinements: Annotated[int, Ge(0)] = static(default=10)
-    """How often the policy is asked again for the `refined` and the `episode` figure."""
+    targets: Annotated[int, Ge(1)] = static(default=10_000, may_change=True)
+    """Unseen targets (episodes, where a task has no targets) in the final evaluation."""
+    interim_targets: Annotated[int, Ge(1)] = static(default=2_000, may_change=True)
+    """The same in the evaluations on the way."""
 
 
-Accuracy = dict[str, Any]
-"""`median_mm`, `p95_mm`, and `within`: percentages of targets within 1, 5, 10 and 20 mm."""
+Results = dict[str, Summary]
+"""A summary for each of the task's metrics, and under `means` the mean of all that was measured, in SI units."""
 
 
 def evaluate(
-    policy: Policy, targets: int, refinements: int = 10, seed: int = 0, progress: Callable[[int], object] | None = None
-) -> tuple[dict[str, Accuracy], float]:
-    """Measure a policy on `targets` unseen targets.
+    policy: Policy, targets: int, seed: int = 0, progress: Callable[[int], object] | None = None
+) -> dict[str, Any]:
+    """Measure a policy.
 
-    Returns the three accuracies by name and the paper-style normalised accuracy of the episodes in percent: what
-    share of the initial distance, on average, is gone at the end. (The paper gives no tolerance; this is the reading
-    that its Figure 8 of normalised errors suggests.) `progress` is told the number of targets done, now and then.
+    Args:
+        policy: The policy, with its task.
+        targets: How many unseen targets, or episodes.
+        seed: Of the targets.
+        progress: Told the number of targets done, now and then.
+
+    Returns:
+        By name of the task's metrics what was measured, summarised as the metric says; and `means`, the mean of every
+        array measured, in SI units.
     """
     key = jax.random.fold_in(jax.random.key(seed), 0xE7A1)
     chunk = min(CHUNK, targets)
-    errors: dict[str, list[np.ndarray]] = {name: [] for name in ("one_shot", "refined", "episode", "start")}
+    parts: dict[str, list[np.ndarray]] = {}
     for done in range(0, targets, chunk):
-        found = _measure(
-            policy.env, policy.agent, policy.config, policy.networks, jax.random.fold_in(key, done), chunk, refinements
-        )
-        for name, values in found.items():
-            errors[name].append(np.asarray(values)[: targets - done])
+        measured = _measure(policy.env, policy, jax.random.fold_in(key, done), chunk)
+        for name, values in measured.items():
+            parts.setdefault(name, []).append(np.asarray(values)[: targets - done])
         if progress:
             progress(min(done + chunk, targets))
-    joined = {name: np.concatenate(values) for name, values in errors.items()}
-    normalised = 100 * (1 - joined["episode"].mean() / joined.pop("start").mean())
-    return {name: accuracy(values) for name, values in joined.items()}, float(normalised)
+    # JAX returns dictionaries sorted; people read them in the task's order.
+    order = [name for name in policy.env.metrics if name in parts]
+    found = {name: np.concatenate(parts[name]) for name in parts}
+    results: dict[str, Any] = {name: policy.env.metrics[name].summary(found[name]) for name in order}
+    return {**results, "means": {name: float(values.mean()) for name, values in found.items()}}
 
 
-def accuracy(errors: np.ndarray) -> Accuracy:
-    """Summarise errors (n,) in metres."""
-    mm = errors * 1e3
-    return {
-        "median_mm": float(np.median(mm)),
-        "p95_mm": float(np.percentile(mm, 95)),
-        "within": {str(limit): float(100 * (mm <= limit).mean()) for limit in WITHIN_MM},
-    }
+def tables(metrics: Mapping[str, Metric], results: Mapping[str, Any]) -> str:
+    """Results as Markdown tables, one for metrics that have the same columns."""
+    by_header: dict[tuple[str, ...], list[list[str]]] = {}
+    for name, metric in metrics.items():
+        if name in results:
+            cells = metric.cells(results[name])
+            by_header.setdefault(tuple(cells), []).append([name, *cells.values()])
+    return "\n\n".join(Table("", ("", *header), rows).markdown() for header, rows in by_header.items())
 
 
-def table(results: dict[str, Accuracy]) -> str:
-    """The accuracies as a Markdown table."""
-    shares = " | ".join(f"<= {limit} mm" for limit in WITHIN_MM)
-    lines = [f"| | median | 95th percentile | {shares} |", "| --- |" + " ---: |" * (2 + len(WITHIN_MM))]
-    for name, found in results.items():
-        shares = " | ".join(f"{found['within'][str(limit)]:.2f} %" for limit in WITHIN_MM)
-        lines.append(f"| {name} | {found['median_mm']:.2f} mm | {found['p95_mm']:.2f} mm | {shares} |")
-    return "\n".join(lines)
-
-
-class Asking(NamedTuple):
-    """Episodes under way: the target to ask for next, the one that led closest so far, and how close, metres."""
-
-    state: State
-    asked: jax.Array
-    best: jax.Array
-    error: jax.Array
-
-
-@partial(jax.jit, static_argnames=("env", "agent", "count", "refinements"))
-def _measure(
-    env: Reach, agent: DDPG, config: DDPGConfig, networks: Networks, key: jax.Array, count: int, refinements: int
-) -> dict[str, jax.Array]:
-    goal_key, pose_key = jax.random.split(key)
-    goals = jax.vmap(env.sample_goal)(jax.random.split(goal_key, count))
-    state = jax.vmap(env.start)(env.arm.sample(pose_key, (count,)), goals)
-    start = state.metrics["distance"]
-    head = agent.head(config, networks.actor, networks.critic, state.obs)
-
-    def step(asking: Asking, again: jax.Array) -> tuple[Asking, None]:
-        asked = jnp.where(again, asking.asked, asking.best)
-        obs = jax.vmap(env.relabel)(asking.state.obs, asked)
-        state = jax.vmap(env.step)(asking.state, agent.answer(networks.actor, obs, head))
-        error = state.metrics["distance"]
-        better = again & (error < asking.error)
-        return Asking(
-            state=state,
-            asked=asked + goals - jax.vmap(env.achieved)(state.obs),
-            best=jnp.where(better[:, None], asked, asking.best),
-            error=jnp.where(better, error, asking.error),
-        ), None
-
-    again = jnp.arange(env.config.episode_length) <= refinements
-    final, _ = jax.lax.scan(step, Asking(state, goals, goals, jnp.full(count, jnp.inf)), again)
-    last = final.state.metrics["distance"]
-    policy = Policy(env, agent, config, networks)
-    return {
-        "one_shot": policy(goals).error,
-        "refined": policy(goals, refinements).error,
-        "episode": jnp.where(jnp.isfinite(last), last, jnp.inf),
-        "start": start,
-    }
+@partial(jax.jit, static_argnames=("env", "n"))
+def _measure(env: Task, policy: Policy, key: jax.Array, n: int) -> dict[str, jax.Array]:
+    return env.evaluate(policy, key, n)

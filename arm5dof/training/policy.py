@@ -1,73 +1,113 @@
-"""A trained policy as an inverse-kinematics solver: targets in, joint angles out."""
+"""A trained policy: observations in, actions out; where its task has a forward model, goals in, joint angles out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
-from jax.typing import ArrayLike
+import numpy as np
+from flax import struct
 
-from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks
-from arm5dof.envs import Reach
+from arm5dof.envs import ForwardModel, Task
+from arm5dof.envs.base import Goal, Observation
+from arm5dof.envs.inverse_kinematics import Answer, solve
+from arm5dof.errors import UserError
+from arm5dof.runtime.tables import Table
 
 
-class Answer(NamedTuple):
-    """Joint positions (n, dof) in radians, the end effector they lead to (n, 3) and its distance from the target (n,)
-    in metres, both by forward kinematics."""
+class Policy(struct.PyTreeNode):
+    """A trained policy for one task. A pytree whose leaves are the networks and the agent's numbers.
 
-    q: jax.Array
-    position: jax.Array
-    error: jax.Array
+    >>> from arm5dof import Run
+    >>> policy = Run.open("runs/reach").policy()  # doctest: +SKIP
+    >>> policy.solve([0.15, 0.05, 0.12], corrections=10).q  # doctest: +SKIP
+    Array([0.39, 0.12, 1.71, -1.45, 0.33], dtype=float32)
+    """
 
-
-@dataclass(frozen=True, eq=False)
-class Policy:
-    """A trained policy for one arm."""
-
-    env: Reach
-    agent: DDPG
+    env: Task = struct.field(pytree_node=False)
+    agent: DDPG = struct.field(pytree_node=False)
     config: DDPGConfig
     networks: Networks
 
-    @property
-    def arm(self) -> Arm:
-        return self.env.arm
+    def __call__(self, obs: Observation, branch: jax.Array | None = None) -> jax.Array:
+        """The policy's actions.
 
-    def __call__(self, targets: ArrayLike, refine: int = 0) -> Answer:
-        """Answer `targets` (n, 3), metres in the world frame, asked from the arm's home pose.
+        Args:
+            obs: Observations, a dictionary of arrays (n, size) as `State.obs` has them.
+            branch: Which of the actor's heads is to answer, (n,) int32; without it the one the critic prefers.
 
-        With `refine` > 0 the policy is asked again as often, with the target shifted by the error it was seen to
-        make; the best answer counts. No Jacobian is involved. The head that the critic chose first is kept.
+        Returns:
+            Actions, (n, action_size) in [-1, 1].
         """
-        return _answer(self.env, self.agent, self.config, self.networks, jnp.asarray(targets, jnp.float32), refine)
+        if not isinstance(obs, dict):
+            raise UserError("a policy acts on observations, dictionaries of arrays: for joint angles use solve")
+        branch = self.branch(obs) if branch is None else branch
+        return self.agent.answer(self.networks.actor, obs, branch)
+
+    def branch(self, obs: Observation) -> jax.Array:
+        """Which of the actor's heads the critic prefers, (n,) int32, for observations as in a call."""
+        return self.agent.head(self.config, self.networks.actor, self.networks.critic, obs)
+
+    @property
+    def forward_model(self) -> ForwardModel:
+        """The task, if it tells where an action leads. Raises `UserError` if it does not."""
+        if not isinstance(self.env, ForwardModel):
+            raise UserError(f"the task {type(self.env).__name__} has no forward model: its policy only acts")
+        return self.env
+
+    def solve(self, *target: Any, corrections: int = 0, **inputs: Any) -> Answer:
+        """Inverse kinematics: ask for joint positions that lead to goals, from the arm's home pose.
+
+        Args:
+            target: The first of the task's goal inputs, which for the tasks that ship is a point (3,), metres, or
+                several, (n, 3).
+            corrections: How often the policy is asked again for a goal shifted by the error it was seen to make
+                (closed-loop target correction). The best answer counts.
+            inputs: The goal inputs by name: `target=...`, and for `reach_pose` `approach=...` (3,) or (n, 3), or
+                `quaternion=...` (4,) or (n, 4), w first.
+
+        Returns:
+            An `Answer`; for one goal without the leading axis.
+
+        Raises:
+            UserError: A goal is missing, not finite or of another shape, or the task has no forward model.
+        """
+        model = self.forward_model
+        names = list(model.goal_inputs)
+        given = {**dict(zip(names, target, strict=False)), **inputs}
+        if len(target) > len(names) or set(given) != set(names) or set(inputs) & set(names[: len(target)]):
+            raise UserError(f"solve takes {' and '.join(names)} for this task, each once")
+        if corrections < 0:
+            raise UserError(f"corrections = {corrections} is negative")
+        single = np.ndim(given[names[0]]) == 1
+        goals = model.goals(**{k: np.asarray(v)[None] if single and np.ndim(v) == 1 else v for k, v in given.items()})
+        if len({len(leaf) for leaf in jax.tree.leaves(goals)}) > 1:
+            raise UserError(f"solve takes as many of each of {' and '.join(names)}")
+        answer = _solve(model, self, goals, corrections)
+        return jax.tree.map(lambda x: x[0], answer) if single else answer
+
+    def _table(self) -> Table:
+        weights = lambda network: f"{sum(leaf.size for leaf in jax.tree.leaves(network)):,} weights"
+        rows = [
+            ("task", type(self.env).__name__),
+            ("actions", str(self.env.action_size)),
+            ("actor", f"{weights(self.networks.actor)}, {self.agent.actor.heads} heads"),
+            ("critic", f"{weights(self.networks.critic)}, {self.agent.critic.form}"),
+        ]
+        if isinstance(self.env, ForwardModel):
+            rows.append(("solve", ", ".join(f"{k} ({', '.join(v)})" for k, v in self.env.goal_inputs.items())))
+        return Table("Policy", ("what", "value"), rows)
+
+    def __repr__(self) -> str:
+        return self._table().text()
+
+    def _repr_html_(self) -> str:
+        return self._table().html()
 
 
-@partial(jax.jit, static_argnames=("env", "agent", "refine"))
-def _answer(env: Reach, agent: DDPG, config: DDPGConfig, networks: Networks, targets: jax.Array, refine: int) -> Answer:
+@partial(jax.jit, static_argnames=("env", "corrections"))
+def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
-    seen = env.start(jnp.asarray(env.arm.home, jnp.float32), targets[0]).obs
-    observe = jax.vmap(partial(env.relabel, seen))
-
-    head = agent.head(config, networks.actor, networks.critic, observe(targets))
-
-    def ask(points: jax.Array) -> Answer:
-        q = env.arm.to_joints(agent.answer(networks.actor, observe(points), head))
-        position = env.arm.forward(q)
-        return Answer(q, position, jnp.linalg.norm(position - targets, axis=-1))
-
-    best = latest = ask(targets)
-    asked = targets
-    for _ in range(refine):
-        asked = asked + targets - latest.position
-        latest = ask(asked)
-        better = latest.error < best.error
-        best = Answer(*(jnp.where(_like(better, a), a, b) for a, b in zip(latest, best, strict=True)))
-    return best
-
-
-def _like(mask: jax.Array, array: jax.Array) -> jax.Array:
-    return mask.reshape(mask.shape + (1,) * (array.ndim - mask.ndim))
+    return solve(env, policy, goals, corrections)

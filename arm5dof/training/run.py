@@ -1,34 +1,65 @@
-"""A run and its folder: `config.toml`, `metrics.csv`, `evaluations.json`, `checkpoints/`, figures and `report.md`."""
+"""A run and its folder, which holds all that it takes to go on or to answer, anywhere:
+
+`config.toml`, `run.json` (versions), `model.mjb.gz` and `model.zip` (the robot), `metrics.csv`, `evaluations.json`,
+`checkpoints/`, `learning.png` and `report.md`.
+"""
 
 from __future__ import annotations
 
 import csv
 import fcntl
+import gzip
+import hashlib
 import json
-import shutil
-import tempfile
 import time
-from collections.abc import Iterator
+import tomllib
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
+import mujoco
+import numpy as np
 
-from arm5dof.arm import load_arm
-from arm5dof.envs import Reach
+from arm5dof.envs import Task
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
-from arm5dof.runtime.progress import Bar
-from arm5dof.training import config, evaluate, report
-from arm5dof.training import trainer as training
+from arm5dof.runtime.tables import Table
+from arm5dof.training import config, evaluate, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
-from arm5dof.training.config import Config
+from arm5dof.training.config import Config, make_env
 from arm5dof.training.policy import Policy
+from arm5dof.training.trainer import Trainer
+
+VERSIONS = ("arm5dof", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy")
 
 
-@dataclass(frozen=True)
+class Reporter(Protocol):
+    """Who is told how a training goes. `arm5dof.runtime.progress.Bar` is one."""
+
+    def update(self, done: int, note: str = "") -> None:
+        """So many episodes are done."""
+        ...
+
+    def say(self, line: str) -> None:
+        """Something happened that is worth a line."""
+        ...
+
+
+class Silent:
+    """A reporter that tells nobody."""
+
+    def update(self, done: int, note: str = "") -> None: ...
+
+    def say(self, line: str) -> None: ...
+
+
+@dataclass(frozen=True, repr=False)
 class Run:
     """One run's folder and configuration."""
 
@@ -36,44 +67,81 @@ class Run:
     config: Config
 
     @staticmethod
-    def create(settings: Config, folder: Path) -> Run:
-        """Make the folder, whole or not at all. Raises `UserError` if it exists: runs never overwrite each other."""
-        if folder.exists():
-            raise UserError(f"{folder} exists: choose another --out, or go on with it by --resume {folder}")
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-        try:
-            temporary.chmod(0o755)
+    def create(settings: Config, folder: str | Path, env: Task | None = None) -> Run:
+        """Make a run's folder, whole or not at all.
+
+        Args:
+            settings: Its configuration.
+            folder: A folder that does not exist yet: runs never overwrite each other.
+            env: The environment, if it has been made from these settings already.
+
+        Raises:
+            UserError: The folder exists, or the environment cannot be made.
+        """
+        folder = Path(folder)
+        env = env or make_env(settings)
+        with files.making(folder) as temporary:
             (temporary / "config.toml").write_text(config.dumps(settings), encoding="utf-8")
-            temporary.rename(folder)
-        except OSError:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
+            model = _keep_model(temporary, env)
+            versions = {name: metadata.version(name) for name in VERSIONS}
+            record = {"versions": versions, "device": device(), "model": model}
+            (temporary / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         return Run(folder, settings)
 
     @staticmethod
-    def open(folder: Path) -> Run:
-        """A run that exists. Raises `UserError` if the folder is none."""
+    def open(folder: str | Path) -> Run:
+        """A run that exists. Raises `UserError` if the folder is none, or its task cannot be imported."""
+        folder = Path(folder)
         path = folder / "config.toml"
-        if not path.is_file():
-            raise UserError(f"{folder} is no run: it has no config.toml; a run is what arm5dof train leaves behind")
-        return Run(folder, config.load(path.resolve()))
+        if not path.is_file() or not (folder / "run.json").is_file():
+            raise UserError(
+                f"{folder} is no run: it has no config.toml and run.json; a run is what arm5dof train leaves behind"
+            )
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{path} is not valid TOML: {error}") from None
+        return Run(folder, config.build(values, str(path)))
 
-    @property
-    def metrics_file(self) -> Path:
-        return self.folder / "metrics.csv"
+    @cached_property
+    def env(self) -> Task:
+        """The environment, with the robot that the run was made for, whatever happened to its MJCF since."""
+        return make_env(self.config, _kept_model(self.folder))
+
+    def trainer(self) -> Trainer:
+        """The run's training program."""
+        return Trainer(self.env, self.config)
 
     def policy(self) -> Policy:
-        """The policy of the newest checkpoint."""
-        trainer = make_trainer(self.config)
-        networks = self.checkpoints().restore_networks(trainer.like.networks)
-        return Policy(trainer.env, trainer.agent, self.config.ddpg, networks)
-
-    def checkpoints(self) -> Checkpoints:
+        """The policy of the newest checkpoint. Raises `UserError` if there is none, or it was made with other
+        settings."""
+        made = self.trainer()
         folder = self.folder / "checkpoints"
         if not folder.is_dir():
-            raise UserError(f"{self.folder} has no checkpoint yet: train it further with --resume {self.folder}")
-        return Checkpoints(folder, read_only=True)
+            raise UserError(f"{self.folder} has no checkpoint yet: resume it")
+        networks = Checkpoints(folder, self._fixed, read_only=True).restore_networks(made.like.networks)
+        return Policy(made.env, made.agent, self.config.ddpg, networks)
+
+    def evaluate(
+        self, targets: int | None = None, seed: int = 0, progress: Callable[[int], object] | None = None
+    ) -> dict[str, Any]:
+        """Measure the newest policy; see `arm5dof.training.evaluate.evaluate`. `targets` as configured if None."""
+        return evaluate.evaluate(self.policy(), targets or self.config.evaluate.targets, seed, progress)
+
+    @property
+    def metrics(self) -> dict[str, list[float]]:
+        """The columns of `metrics.csv`, an epoch each: counters, seconds, and means over the epoch in SI units."""
+        rows = _read_rows(self.folder / "metrics.csv")
+        return {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ())}
+
+    @property
+    def evaluations(self) -> list[dict[str, Any]]:
+        """The evaluations so far: counters, `targets`, and what `evaluate` returns."""
+        return _read_evaluations(self.folder / "evaluations.json")
+
+    @property
+    def _fixed(self) -> dict[str, Any]:
+        return config.fixed(self.config)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -85,87 +153,171 @@ class Run:
                 raise UserError(f"{self.folder} is being trained by another process") from None
             yield
 
+    def _table(self) -> Table:
+        task = config.task_class(self.config.task)
+        rows = [
+            (str(e["episodes"]), str(e["targets"]), name, metric.text(e[name]))
+            for e in self.evaluations
+            for name, metric in task.metrics.items()
+            if name in e
+        ]
+        return Table(f"Run {self.folder}, task {self.config.task}", ("episodes", "targets", "metric", "value"), rows)
 
-def make_trainer(settings: Config) -> training.Trainer:
+    def __repr__(self) -> str:
+        return self._table().text()
+
+    def _repr_html_(self) -> str:
+        return self._table().html()
+
+
+def train(settings: Config, folder: str | Path | None = None, reporter: Reporter | None = None) -> Run:
+    """Train a new run to its end.
+
+    Args:
+        settings: Its configuration, from `load_config`.
+        folder: The run's folder, which must not exist; the first free one of `runs/<task>`, `runs/<task>-2`, ... if
+            None.
+        reporter: Told how it goes.
+
+    Returns:
+        The run.
+
+    Raises:
+        UserError: The configuration cannot be trained, or the folder exists.
+    """
+    made = make_trainer(settings)  # What is wrong with the robot or the budget is said before a folder exists.
+    run = Run.create(settings, folder or free_folder(settings.task.rpartition(":")[2]), made.env)
+    return resume(run, reporter, made)
+
+
+def make_trainer(settings: Config) -> Trainer:
     """The training program that a configuration describes. Raises `UserError` if there is something wrong with it."""
-    return training.Trainer(Reach(load_arm(settings.env.arm, settings.env.site), settings.env), settings)
+    made = Trainer(make_env(settings), settings)
+    made.check()
+    return made
 
 
-def train(run: Run, trainer: training.Trainer | None = None) -> list[dict[str, Any]]:
-    """Train a run to its end, from its newest checkpoint if it has one; `trainer` is its training program, if it has
-    been made already. Returns its evaluations."""
+def resume(run: Run, reporter: Reporter | None = None, made: Trainer | None = None) -> Run:
+    """Train a run to its end, from its newest checkpoint if it has one.
+
+    Args:
+        run: The run.
+        reporter: Told how it goes.
+        made: Its training program, if it has been made already.
+
+    Raises:
+        UserError: Its checkpoint is damaged or was made with other settings, or another process trains it.
+    """
     with run.locked():
-        return _train(run, trainer or make_trainer(run.config))
+        _train(run, made or run.trainer(), reporter or Silent())
+    return run
 
 
-def _train(run: Run, trainer: training.Trainer) -> list[dict[str, Any]]:
-    budget = run.config.train
-    checkpoints = Checkpoints(run.folder / "checkpoints")
-    length = run.config.env.episode_length
-    with Bar("training", budget.episodes, "episodes") as bar:
-        bar.update(0, "compiling")
-        if checkpoints.latest is None:
-            bar.say(
-                f"replay buffer: {run.config.ddpg.replay_capacity} transitions, {trainer.replay_bytes / 1e6:.1f} MB"
-            )
-            trainer.start()
-        else:
-            trainer.state = checkpoints.restore(trainer.like)
-            bar.say(f"resuming {run.folder} at episode {trainer.counters.episodes}")
-        at = trainer.counters
-        rows = _read_rows(run.metrics_file, at.steps)
-        evaluations = _read_evaluations(run.folder / "evaluations.json", at.steps)
-        before = float(rows[-1]["seconds"]) if rows else 0.0
-        started = time.monotonic()
+def _train(run: Run, made: Trainer, reporter: Reporter) -> None:
+    budget, length = run.config.train, made.env.episode_length
+    checkpoints = Checkpoints(run.folder / "checkpoints", run._fixed)
+    reporter.update(0, "compiling")
+    if checkpoints.latest is None:
+        reporter.say(f"replay buffer: {run.config.ddpg.replay_capacity} transitions, {made.replay_bytes / 1e6:.1f} MB")
+        made.start()
+    else:
+        made.state = checkpoints.restore(made.like)
+        reporter.say(f"resuming {run.folder} at episode {made.counters.episodes}")
+    at = made.counters
+    rows = [row for row in _read_rows(run.folder / "metrics.csv") if int(row["steps"]) <= at.steps]
+    evaluations = [e for e in run.evaluations if e["steps"] <= at.steps]
+    before = float(rows[-1]["seconds"]) if rows else 0.0
+    started = time.monotonic()
 
-        with _appending(run.metrics_file, rows) as write:
-            while True:
-                at = trainer.counters
-                due = at.steps > 0 and at.steps % (budget.evaluate_every // budget.num_envs * length) == 0
-                if (due or trainer.finished) and all(e["steps"] != at.steps for e in evaluations):
-                    evaluations.append(_evaluate(run, trainer, bar))
-                    files.write_text(run.folder / "evaluations.json", json.dumps(evaluations, indent=1) + "\n")
-                if trainer.finished:
-                    break
-                metrics = trainer.advance()
-                at, seconds = trainer.counters, time.monotonic() - started
-                rows.append(training.row(at, before + seconds, metrics))
-                write(rows[-1])
-                bar.update(at.episodes, _note(rows, metrics))
-                if at.steps % (budget.checkpoint_every // budget.num_envs * length) == 0 or trainer.finished:
-                    checkpoints.save(trainer.state)
-        report.write(run.folder, run.config, rows, evaluations)
-    return evaluations
+    with _appending(run.folder / "metrics.csv", rows) as write:
+        while True:
+            at = made.counters
+            due = at.steps > 0 and at.steps % (budget.evaluate_every // budget.num_envs * length) == 0
+            if (due or made.finished) and all(e["steps"] != at.steps for e in evaluations):
+                evaluations.append(_evaluate(run, made, reporter))
+                files.write_text(run.folder / "evaluations.json", json.dumps(evaluations, indent=1) + "\n")
+            if made.finished:
+                break
+            metrics = made.advance()
+            at, seconds = made.counters, time.monotonic() - started
+            rows.append(trainer.row(at, before + seconds, metrics))
+            write(rows[-1])
+            reporter.update(at.episodes, _note(made.env, rows, metrics))
+            if at.steps % (budget.checkpoint_every // budget.num_envs * length) == 0 or made.finished:
+                checkpoints.save(made.state)
+    report.write(run.folder, run.config, made.env, rows, evaluations)
 
 
-def _evaluate(run: Run, trainer: training.Trainer, bar: Bar) -> dict[str, Any]:
-    protocol, at = run.config.evaluate, trainer.counters
-    targets = protocol.targets if trainer.finished else protocol.interim_targets
-    show = lambda done: bar.update(at.episodes, f"evaluating {done}/{targets} targets")
+def _evaluate(run: Run, made: Trainer, reporter: Reporter) -> dict[str, Any]:
+    protocol, at, env = run.config.evaluate, made.counters, made.env
+    targets = protocol.targets if made.finished else protocol.interim_targets
+    show = lambda done: reporter.update(at.episodes, f"evaluating {done}/{targets} targets")
     show(0)
-    results, normalised = evaluate.evaluate(
-        trainer.policy(), targets, protocol.refinements, progress=show, seed=run.config.train.seed
+    results = evaluate.evaluate(made.policy(), targets, run.config.train.seed, show)
+    reporter.say(
+        f"episode {at.episodes}: {env.metrics[env.headline].text(results[env.headline])} "
+        f"({env.headline}, {targets} unseen targets)"
     )
-    name = report.headline(run.config)
-    bar.say(
-        f"episode {at.episodes}: {results[name]['within']['10']:.2f} % within 10 mm, "
-        f"median {results[name]['median_mm']:.2f} mm ({name}, {targets} unseen targets)"
-    )
-    return {**at._asdict(), "targets": targets, "normalised": normalised, **results}
+    return {**at._asdict(), "targets": targets, **results}
 
 
-def _note(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
-    """Rates over the last few epochs, and the policy's mean error."""
+def _note(env: Task, rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
+    """Rates over the last few epochs, and what there is to watch of the policy or else the reward."""
     recent = rows[-6:]
     if len(recent) < 2:
         return ""
     first, last = recent[0], recent[-1]
     elapsed = max(float(last["seconds"]) - float(first["seconds"]), 1e-9)
     rate = {name: (float(last[name]) - float(first[name])) / elapsed for name in ("env_steps", "updates")}
-    return (
-        f"{rate['env_steps']:.0f} env steps/s  {rate['updates']:.0f} updates/s  "
-        f"error {1e3 * metrics['policy_distance']:.1f} mm"
+    watched = {name: env.metrics[name] for name in metrics if name in env.metrics and name.startswith("policy_")}
+    shown = [f"{name.removeprefix('policy_')} {m.scale * metrics[name]:.1f} {m.unit}" for name, m in watched.items()]
+    return "  ".join(
+        [
+            f"{rate['env_steps']:.0f} env steps/s  {rate['updates']:.0f} updates/s",
+            *(shown or [f"reward {metrics['reward']:.3g}"]),
+        ]
     )
+
+
+def _keep_model(folder: Path, env: Task) -> dict[str, str]:
+    """Write the task's MuJoCo model into a folder: compiled, which only the same MuJoCo reads, and as MJCF with its
+    assets, which newer ones read too, to the six digits that MuJoCo writes. Returns the files' digests."""
+    if env.mj_model is None:
+        return {}
+    buffer = np.empty(mujoco.mj_sizeModel(env.mj_model), np.uint8)
+    mujoco.mj_saveModel(env.mj_model, None, buffer)
+    (folder / "model.mjb.gz").write_bytes(gzip.compress(buffer.tobytes(), 3, mtime=0))
+    if env.mj_spec is not None:
+        env.mj_spec.to_zip(str(folder / "model.zip"))
+    return {path.name: _digest(path) for path in sorted(folder.glob("model.*"))}
+
+
+def _kept_model(folder: Path) -> mujoco.MjModel | None:
+    """The model in a run's folder, or None if it has none. Raises `UserError` if it is damaged or cannot be read."""
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    if not record["model"]:
+        return None
+    same = record["versions"]["mujoco"] == metadata.version("mujoco")
+    name = "model.mjb.gz" if same else "model.zip"
+    path = folder / name
+    if name not in record["model"]:
+        raise UserError(
+            f"{folder} keeps its robot as MuJoCo {record['versions']['mujoco']} has it: install that version"
+        )
+    if not path.is_file() or _digest(path) != record["model"][name]:
+        raise UserError(f"{path}, the run's robot, is missing or damaged: take it from a copy of the run")
+    if same:
+        return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": gzip.decompress(path.read_bytes())})
+    warnings.warn(
+        f"{folder} was made with MuJoCo {record['versions']['mujoco']}: its robot is compiled anew from MJCF, whose "
+        "numbers have six digits",
+        stacklevel=2,
+    )
+    return mujoco.MjSpec.from_zip(str(path)).compile()
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @contextmanager
@@ -188,19 +340,16 @@ def _appending(path: Path, rows: list[dict[str, Any]]) -> Iterator[Any]:
         yield write
 
 
-def _read_rows(path: Path, steps: int) -> list[dict[str, Any]]:
-    """The complete rows up to a checkpoint."""
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    """The complete rows."""
     if not path.exists():
         return []
     with open(path, newline="") as handle:
-        rows = [row for row in csv.DictReader(handle) if all(row.values()) and None not in row]
-    return [row for row in rows if int(row["steps"]) <= steps]
+        return [row for row in csv.DictReader(handle) if all(row.values()) and None not in row]
 
 
-def _read_evaluations(path: Path, steps: int) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    return [found for found in json.loads(path.read_text()) if found["steps"] <= steps]
+def _read_evaluations(path: Path) -> list[dict[str, Any]]:
+    return json.loads(path.read_text()) if path.exists() else []
 
 
 def free_folder(name: str) -> Path:

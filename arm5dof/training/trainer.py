@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
@@ -12,7 +12,7 @@ import psutil
 from annotated_types import Ge
 
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
-from arm5dof.envs import Reach
+from arm5dof.envs import Task
 from arm5dof.errors import UserError
 from arm5dof.runtime import xla
 from arm5dof.runtime.programs import Program
@@ -20,7 +20,6 @@ from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
 
 Count = Annotated[int, Ge(1)]
-PROBES = 500
 
 
 @settings
@@ -29,15 +28,15 @@ class TrainConfig:
 
     seed: Annotated[int, Ge(0)] = static(default=0)
     """Of all random numbers: same seed and machine, same bits."""
-    episodes: Count = static(default=400)
+    episodes: Count = static(default=400, may_change=True)
     """Episodes in all; a multiple of the number of environments."""
     num_envs: Count = static(default=50)
     """Environments that run side by side."""
     epoch_steps: Count = static(default=16)
     """Steps of every environment in one device call; divides the episode's length. Metrics have this grain."""
-    evaluate_every: Count = static(default=100)
+    evaluate_every: Count = static(default=100, may_change=True)
     """Episodes between evaluations; a multiple of the number of environments."""
-    checkpoint_every: Count = static(default=50)
+    checkpoint_every: Count = static(default=50, may_change=True)
     """Episodes between checkpoints; a multiple of the number of environments."""
 
 
@@ -55,13 +54,13 @@ class Trainer:
     """A compiled training program for one environment and configuration.
 
     `state` is the whole run, made by `start` or restored from a checkpoint; `advance` takes it one epoch further.
-    Raises `UserError` if the budget does not divide.
+    Raises `UserError` if the budget does not divide, or the agent does not go with the task.
     """
 
     state: Training
 
-    def __init__(self, env: Reach, config: Settings) -> None:
-        budget, length = config.train, env.config.episode_length
+    def __init__(self, env: Task, config: Settings) -> None:
+        budget, length = config.train, env.episode_length
         for name in ("episodes", "evaluate_every", "checkpoint_every"):
             if getattr(budget, name) % budget.num_envs:
                 raise UserError(
@@ -100,21 +99,21 @@ class Trainer:
 
     def start(self) -> None:
         """Begin a new run."""
-        with xla.uncollected():
+        with xla.gc_paused():
             self.check()
             epoch = self._epoch  # Everything else is compiled while this is.
             state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
             # Bound to its device, as epochs return it: the policy would be compiled once for either.
             self.state = jax.tree.map(lambda x: jax.device_put(x, x.sharding), state)
-            self._policy_distance()
+            self._watch()
             epoch.result()
 
     def advance(self) -> dict[str, float]:
-        """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and the
-        mean distance in metres by which one answer of the policy, without noise, misses a few hundred targets."""
+        """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and what the
+        task has to watch of the policy without noise."""
         leaves, metrics = self._epoch.result()(*self._leaves(self.state))
         self.state = jax.tree.unflatten(jax.tree.structure(self.like), leaves)
-        metrics["policy_distance"] = self._policy_distance()
+        metrics.update(self._watch())
         return {name: float(value) for name, value in jax.device_get(metrics).items()}
 
     @cached_property
@@ -128,8 +127,8 @@ class Trainer:
             training, metrics = self.agent.epoch(jax.tree.unflatten(config, numbers), training, steps)
             return jax.tree.leaves(training), metrics
 
-        known = self.env.identity
-        identity = None if known is None else (*known, config, self.total_steps, steps)
+        task = self.env.fingerprint
+        identity = None if task is None else (*task, config, self.total_steps, steps)
         return Program(epoch, self._leaves(self.like), identity)
 
     def _leaves(self, state: Training) -> tuple[list[float], list[jax.Array]]:
@@ -141,25 +140,17 @@ class Trainer:
         epoch = self._program.jit(donate_argnums=1, compiler_options=xla.effort(2))
         return ThreadPoolExecutor(1).submit(epoch.lower(*self._leaves(self.like)).compile)
 
-    def _policy_distance(self) -> jax.Array:
+    def _watch(self) -> dict[str, jax.Array]:
+        """What the task has to watch, on random numbers that neither training nor evaluation uses."""
         policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)
-        return policy(self._probes).error.mean()
-
-    @cached_property
-    def _probes(self) -> jax.Array:
-        """Targets for watching the policy, from random numbers that neither training nor evaluation uses."""
-
-        def sample(key: jax.Array) -> jax.Array:
-            return jax.vmap(self.env.sample_goal)(jax.random.split(jax.random.fold_in(key, 0x9B0E), PROBES))
-
-        return jax.jit(sample, compiler_options=xla.effort(0))(jax.random.key(self.config.train.seed))
+        return _watched(self.env, policy, jax.random.fold_in(jax.random.key(self.config.train.seed), 0x9B0E))
 
     @property
     def counters(self) -> Counters:
         """How far the run is."""
         steps = int(self.state.steps)
         env_steps = steps * self.config.train.num_envs
-        return Counters(steps, env_steps // self.env.config.episode_length, env_steps, int(self.state.updates))
+        return Counters(steps, env_steps // self.env.episode_length, env_steps, int(self.state.updates))
 
     @property
     def finished(self) -> bool:
@@ -169,6 +160,11 @@ class Trainer:
         """The policy as it is now. Its networks are copies: the next epoch reuses the originals' memory."""
         networks = jax.tree.map(jnp.copy, self.state.networks)
         return Policy(self.env, self.agent, self.config.ddpg, networks)
+
+
+@partial(jax.jit, static_argnames="env")
+def _watched(env: Task, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
+    return env.watch(policy, key)
 
 
 def memory_free() -> int:

@@ -22,7 +22,8 @@ from arm5dof.cli import main as cli
 from arm5dof.errors import UserError
 from arm5dof.training import checkpoint
 from arm5dof.training.checkpoint import Checkpoints
-from arm5dof.training.run import Run, free_folder, make_trainer
+from arm5dof.training.config import fixed
+from arm5dof.training.run import Run, free_folder
 
 TINY = (
     "kinematic.toml --episodes 4 --num-envs 2 --evaluate-every 2 --checkpoint-every 2 --episode-length 32 "
@@ -66,15 +67,15 @@ def digest(folder):
 
 def test_a_run_leaves_everything(trained):
     names = {p.name for p in trained.iterdir()}
-    figures = {"figure_7_reward.png", "figure_8_error.png"}
-    assert {"config.toml", "metrics.csv", "evaluations.json", "checkpoints", "report.md"} | figures <= names
-    for figure in figures:
-        assert (trained / figure).read_bytes().startswith(b"\x89PNG")
+    kept = {"config.toml", "run.json", "model.mjb.gz", "model.zip"}
+    made = {"metrics.csv", "evaluations.json", "checkpoints", "report.md", "learning.png"}
+    assert kept | made <= names
+    assert (trained / "learning.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(open(trained / "metrics.csv")))
     assert [int(row["steps"]) for row in rows] == [16, 32, 48, 64]
     assert int(rows[-1]["episodes"]) == 4 and int(rows[-1]["env_steps"]) == 128
     report = (trained / "report.md").read_text()
-    assert "Table 2" in report and "| paper, Mean |" in report
+    assert "| one_shot |" in report and "| ddpg.batch_size | 32 |" in report
     assert [e["episodes"] for e in json.loads((trained / "evaluations.json").read_text())] == [2, 4]
 
 
@@ -238,11 +239,12 @@ def newest(folder):
 
 @pytest.fixture(scope="module")
 def like(trained):
-    return make_trainer(Run.open(trained).config).like
+    return Run.open(trained).trainer().like
 
 
 def restore(folder, like):
-    return jax.tree.leaves(Checkpoints(folder / "checkpoints", read_only=True).restore(like))
+    made_with = fixed(Run.open(folder).config)
+    return jax.tree.leaves(Checkpoints(folder / "checkpoints", made_with, read_only=True).restore(like))
 
 
 @pytest.mark.parametrize("kind", ["truncated", "flipped", "removed"])
@@ -287,8 +289,8 @@ def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails, monkeypatc
     folder = copy(trained, tmp_path / "other")
     text = (folder / "config.toml").read_text()
     (folder / "config.toml").write_text(text.replace("actor_width = 16", "actor_width = 24"))
-    assert "does not fit the run's config.toml" in fails("eval", folder)
-    assert "does not fit the run's config.toml" in fails("train", "--resume", folder)
+    assert "ddpg.actor_width = 16, now 24): set them back in config.toml" in fails("eval", folder)
+    assert "ddpg.actor_width = 16, now 24): set them back in config.toml" in fails("train", "--resume", folder)
 
     folder = copy(trained, tmp_path / "foreign")
     for item in newest(folder).iterdir():
@@ -302,7 +304,8 @@ def test_foreign_checkpoints_are_recognised(trained, tmp_path, fails, monkeypatc
     folder = tmp_path / "empty"
     folder.mkdir()
     assert "is no run" in fails("eval", folder)
-    (folder / "config.toml").write_text((trained / "config.toml").read_text())
+    for name in ("config.toml", "run.json", "model.mjb.gz"):
+        (folder / name).write_bytes((trained / name).read_bytes())
     assert "no checkpoint yet" in fails("eval", folder)
 
 
@@ -311,8 +314,8 @@ def test_a_full_disk_loses_nothing(tmp_path):
     folder = tmp_path / "full"
     code = """
 import resource, sys
-from arm5dof import cli
-from arm5dof.checkpoint import Checkpoints
+from arm5dof.cli.main import main
+from arm5dof.training.checkpoint import Checkpoints
 
 save = Checkpoints.save
 def limited(self, training):
@@ -320,7 +323,7 @@ def limited(self, training):
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
     save(self, training)
 Checkpoints.save = limited
-sys.exit(cli.main(sys.argv[1:]))
+sys.exit(main(sys.argv[1:]))
 """
     done = subprocess.run(
         [sys.executable, "-c", code, "train", *TINY.split(), "--out", str(folder)],

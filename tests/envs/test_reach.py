@@ -38,7 +38,7 @@ def step(env: Reach):
 @pytest.fixture(scope="module", params=KINDS)
 def seeing(request: pytest.FixtureRequest, arm: Arm) -> Reach:
     """A kinematic environment for each kind of observation."""
-    return Reach(arm, ReachConfig(dynamics="kinematic", observation=request.param))
+    return Reach(ReachConfig(dynamics="kinematic", observation=request.param), arm)
 
 
 def poses(arm: Arm, count: int, seed: int = 0) -> jax.Array:
@@ -182,14 +182,14 @@ def test_observations_are_dimensionless(seeing: Reach):
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_relabel_is_the_observation_of_another_goal(seeing: Reach, moved: bool):
+def test_replace_goal_gives_the_observation_of_another_goal(seeing: Reach, moved: bool):
     arm = seeing.arm
     q, goal, other = poses(arm, ENVS), goals(arm, ENVS), goals(arm, ENVS, seed=101)
     state = start(seeing)(q, goal)
     if moved:
         action = actions(seeing, (ENVS,))
         state, q = step(seeing)(state, action), arm.to_joints(action)
-    relabelled = jax.vmap(seeing.relabel)(state.obs, other)
+    relabelled = jax.vmap(seeing.replace_goal)(state.obs, other)
     assert_same_obs(relabelled, start(seeing)(q, other).obs, atol=1e-6)
     assert np.abs(relabelled["state"] - state.obs["state"]).max() > 0.1
 
@@ -197,7 +197,7 @@ def test_relabel_is_the_observation_of_another_goal(seeing: Reach, moved: bool):
 def test_relabel_keeps_velocities(servo: Reach):
     arm = servo.arm
     state = step(servo)(start(servo)(poses(arm, ENVS), goals(arm, ENVS)), actions(servo, (ENVS,)))
-    relabelled = jax.vmap(servo.relabel)(state.obs, goals(arm, ENVS, seed=101))
+    relabelled = jax.vmap(servo.replace_goal)(state.obs, goals(arm, ENVS, seed=101))
     moved = slice(6 * arm.dof + arm.dof, 6 * arm.dof + 2 * arm.dof)
     assert np.abs(state.obs["state"][:, moved]).max() > 1e-3
     np.testing.assert_array_equal(relabelled["state"][:, moved], state.obs["state"][:, moved])
@@ -213,15 +213,19 @@ def test_achieved_is_the_end_effector(seeing: Reach):
 def test_goal_reward_is_eq_7(kinematic: Reach):
     a, b = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 100, 3))
     by_hand = -np.sqrt(((a - b) ** 2).sum(1))
-    np.testing.assert_allclose(jax.vmap(kinematic.goal_reward)(jnp.array(a), jnp.array(b)), by_hand, atol=1e-7)
-    assert kinematic.goal_reward(jnp.ones(3), jnp.ones(3)) == 0
+    np.testing.assert_allclose(
+        jax.vmap(lambda a, b: kinematic.goal_reward(a, b, jnp.zeros(5))[0])(jnp.array(a), jnp.array(b)),
+        by_hand,
+        atol=1e-7,
+    )
+    assert kinematic.goal_reward(jnp.ones(3), jnp.ones(3), jnp.zeros(5)) == (0, 0)
 
 
 def test_outcome_foresees_where_an_action_leads(seeing: Reach):
     """What the critic is shown of an action agrees with the observation after taking it."""
     arm = seeing.arm
     state, action = start(seeing)(poses(arm, ENVS), goals(arm, ENVS)), actions(seeing, (ENVS,))
-    foreseen = jax.vmap(seeing.outcome)(state.obs, action)
+    foreseen = jax.vmap(seeing.critic_input)(state.obs, action)
     seen = step(seeing)(state, action).obs["privileged_state"]
     assert foreseen.shape == (ENVS, arm.dof + 9)
     np.testing.assert_allclose(foreseen[:, : arm.dof + 6], seen, atol=2e-6)
@@ -305,14 +309,14 @@ def test_an_arm_without_servos_can_only_be_posed():
     spec = serial_arm(3, seed=0)
     spec.delete(list(spec.actuators)[1])
     arm = load_arm(spec)
-    with pytest.raises(UserError, match=r"joint 'joint_1' has no position actuator.*--dynamics kinematic"):
-        Reach(arm, ReachConfig(dynamics="servo"))
-    assert Reach(arm, ReachConfig(dynamics="kinematic")).action_size == 3
+    with pytest.raises(UserError, match=r"joint 'joint_1' has no position actuator.*choose dynamics = .kinematic."):
+        Reach(ReachConfig(dynamics="servo"), arm)
+    assert Reach(ReachConfig(dynamics="kinematic"), arm).action_size == 3
 
 
 def test_seven_joints_without_a_marker():
     arm = load_arm("arm7.xml")
-    env = Reach(arm, ReachConfig(dynamics="kinematic", observation="full"))
+    env = Reach(ReachConfig(dynamics="kinematic", observation="full"), arm)
     state = reset(env)(jax.random.split(jax.random.key(0), 8))
     assert state.obs["state"].shape == (8, 6 * 7 + 2 * 7 + 6)
     for i in range(8):

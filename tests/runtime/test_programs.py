@@ -156,5 +156,5 @@ def test_an_environment_of_others_is_not_kept(folder: Path, arm: Arm):
     class Mine(Reach):
         pass
 
-    trained(Trainer(Mine(arm, ReachConfig(dynamics="kinematic", episode_length=4)), settings()))
+    trained(Trainer(Mine(ReachConfig(dynamics="kinematic", episode_length=4), arm), settings()))
     assert not folder.exists()

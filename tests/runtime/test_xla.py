@@ -27,7 +27,7 @@ def test_the_users_own_setting_wins():
 
 @pytest.mark.parametrize("own", ["", "--xla_cpu_use_fusion_emitters=true"])
 def test_jax_starts_with_what_was_set(own):
-    code = "import arm5dof, os, jax; jax.devices(); print(os.environ.get('XLA_FLAGS', ''))"
+    code = "import os, jax; from arm5dof import Arm; jax.devices(); print(os.environ.get('XLA_FLAGS', ''))"
     environment = {**os.environ, "XLA_FLAGS": own}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert ("=true" in done.stdout) == bool(own)

@@ -9,22 +9,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm5dof.ddpg import DDPGConfig
+from arm5dof.envs import ReachConfig
+from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.training import config
 
-DEFAULT = config.build({}, "test")
-
 
 @pytest.mark.parametrize("name", files.shipped("experiments", ".toml"))
 def test_shipped_experiments_survive_a_round_trip(name, tmp_path):
-    loaded = config.load(name)
+    loaded = config.load_config(name)
     (tmp_path / "again.toml").write_text(config.dumps(loaded))
-    assert config.load(tmp_path / "again.toml") == loaded
+    assert config.load_config(tmp_path / "again.toml") == loaded
 
 
 def test_default_experiment_is_the_papers_budget_in_servo_dynamics():
-    reach = config.load("reach.toml")
+    reach = config.load_config()
     assert (reach.env.dynamics, reach.train.episodes, reach.env.episode_length) == ("servo", 400, 160)
 
 
@@ -38,7 +38,7 @@ def test_every_field_is_documented_and_overridable():
         assert f.help, f.name
         text = str(f.default).lower() if isinstance(f.default, bool) else str(f.default)
         for flag in (f.name, f.name.replace("_", "-"), f"{f.section}.{f.name}"):
-            assert config.load("reach.toml", {flag: text}) is not None
+            assert config.load_config("reach.toml", **{flag: text}) is not None
 
 
 @given(
@@ -56,7 +56,7 @@ def test_any_valid_value_survives_text(lr, discount, batch, norm, activation):
         "ddpg.layer_norm": str(norm).lower(),
         "activation": activation,
     }
-    found = config.load("reach.toml", overrides).ddpg
+    found = config.load_config("reach.toml", **overrides).ddpg
     assert (found.actor_lr, found.discount, found.batch_size) == (lr, discount, batch)
     assert (found.layer_norm, found.activation) == (norm, activation)
 
@@ -86,7 +86,7 @@ def test_mistakes_are_named_in_one_line(values, said):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        ({"batch-sise": "3"}, "--batch-size"),
+        ({"batch-sise": "3"}, "'batch_size'"),
         ({"zzz": "3"}, "--help"),
         ({"batch-size": "many"}, "integer"),
         ({"discount": "2"}, "less than"),
@@ -96,7 +96,7 @@ def test_mistakes_are_named_in_one_line(values, said):
 )
 def test_mistakes_on_the_command_line(overrides, said):
     with pytest.raises(UserError, match=re.escape(said)):
-        config.load("reach.toml", overrides)
+        config.load_config("reach.toml", **overrides)
 
 
 def test_numbers_are_traced_and_sizes_are_not():
@@ -111,10 +111,74 @@ def test_numbers_are_traced_and_sizes_are_not():
 
 def test_missing_and_broken_files(tmp_path):
     with pytest.raises(UserError, match=r"kinematic\.toml, paper\.toml, reach\.toml"):
-        config.load("nothing.toml")
+        config.load_config("nothing.toml")
     (tmp_path / "broken.toml").write_text("[env\n")
     with pytest.raises(UserError, match="not valid TOML"):
-        config.load(tmp_path / "broken.toml")
+        config.load_config(tmp_path / "broken.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match="not valid TOML"):
-        config.load(tmp_path / "binary.toml")
+        config.load_config(tmp_path / "binary.toml")
+
+
+def test_what_a_file_leaves_open_is_as_in_its_tasks_file(tmp_path):
+    (tmp_path / "mine.toml").write_text('[env]\ndynamics = "kinematic"\n[ddpg]\nheads = 3\n')
+    mine, reach = config.load_config(tmp_path / "mine.toml"), config.load_config("reach.toml")
+    assert mine.ddpg == dataclasses.replace(reach.ddpg, heads=3) != DDPGConfig(heads=3)
+
+
+def test_text_and_numbers_are_alike():
+    texts = config.load_config(actor_lr=".001", layer_norm="TRUE", heads="4", arm="arm7.xml")
+    assert texts == config.load_config(actor_lr=0.001, layer_norm=True, heads=4, arm="arm7.xml")
+
+
+@pytest.mark.parametrize(
+    ("cls", "values", "said"),
+    [
+        (DDPGConfig, {"actor_lr": -1}, "actor_lr = -1: input should be greater than 0"),
+        (DDPGConfig, {"heads": 2.5}, "valid integer"),
+        (ReachConfig, {"dynamics": "nope"}, "dynamics = 'nope': input should be 'servo' or 'kinematic'"),
+        (ReachPoseConfig, {"substeps": 0}, "substeps"),
+    ],
+)
+def test_constructors_validate(cls, values, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        cls(**values)
+    with pytest.raises(UserError, match=re.escape(said)):
+        dataclasses.replace(cls(), **values)
+
+
+def test_traced_numbers_pass_for_numbers():
+    rate = jax.jit(lambda lr: DDPGConfig(actor_lr=lr).actor_lr * 2)(0.25)
+    assert rate == 0.5
+    assert jax.vmap(lambda lr: dataclasses.replace(DDPGConfig(), actor_lr=lr).actor_lr)(jax.numpy.ones(3)).shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        ("nothing", "no task 'nothing': it is one of those shipped (reach, reach_pose)"),
+        ("../reach", "no task"),
+        ("nowhere:Class", "cannot import task 'nowhere:Class' (ModuleNotFoundError"),
+        ("json:JSONDecoder", "'json:JSONDecoder' is no task: it takes a class that inherits from arm5dof.Task"),
+        ("json:Nothing", "is no task"),
+        (3, "no task 3"),
+    ],
+)
+def test_tasks_that_are_none(task, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        config.build({"env": {"task": task}}, "file.toml")
+
+
+def test_a_name_in_two_sections_needs_its_section():
+    known = [*config.fields(), config.Field("env", "seed", 0, "", None)]
+    with pytest.raises(UserError, match=r"train\.seed or env\.seed"):
+        config.find("seed", known)
+    assert config.find("env.seed", known).section == "env"
+
+
+def test_a_bare_name_that_could_be_either_of_two_files_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kinematic.toml").write_text("[train]\nseed = 7\n")
+    with pytest.raises(UserError, match=r"say \./kinematic\.toml"):
+        config.load_config("kinematic.toml")
+    assert config.load_config("./kinematic.toml").train.seed == 7

@@ -11,12 +11,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from arm5dof.ddpg import DDPG, DDPGConfig
+from arm5dof.ddpg import DDPG
 from arm5dof.envs import Reach
+from arm5dof.envs.metrics import Error
 from arm5dof.training import evaluate
+from arm5dof.training.config import load_config
 from arm5dof.training.policy import Policy
 
-CONFIG = DDPGConfig(actor_width=16, actor_depth=1, critic_width=8, critic_depth=1, heads=3)
+SMALL = {"actor_width": 16, "actor_depth": 1, "critic_width": 8, "critic_depth": 1, "heads": 3}
+CONFIG = load_config("kinematic.toml", **SMALL).ddpg
 
 
 @pytest.fixture(scope="module")
@@ -26,16 +29,22 @@ def policy(kinematic: Reach) -> Policy:
     return Policy(kinematic, agent, CONFIG, jax.jit(agent.init)(CONFIG, jax.random.key(0)).networks)
 
 
+def refined(policy: Policy, refinements: int) -> Policy:
+    """The same policy, its evaluation with another number of corrections."""
+    return policy.replace(env=Reach(replace(policy.env.config, refinements=refinements), policy.env.arm))
+
+
 @pytest.fixture(scope="module")
 def goals(kinematic: Reach) -> jax.Array:
     return jax.vmap(kinematic.sample_goal)(jax.random.split(jax.random.key(1), 100))
 
 
 def test_errors_are_what_c_mujoco_finds(policy: Policy, goals: jax.Array):
-    answer = policy(goals, refine=2)
-    arm = policy.arm
+    answer = policy.solve(goals, corrections=2)
+    arm = policy.env.arm
     data = mujoco.MjData(arm.mj_model)
-    for q, position, error, goal in zip(*map(np.asarray, (*answer, goals)), strict=True):
+    parts = (answer.q, answer.outcome, answer.errors["distance"], goals)
+    for q, position, error, goal in zip(*map(np.asarray, parts), strict=True):
         data.qpos[arm.qpos] = q
         mujoco.mj_kinematics(arm.mj_model, data)
         found = data.site_xpos[arm.site]
@@ -44,13 +53,13 @@ def test_errors_are_what_c_mujoco_finds(policy: Policy, goals: jax.Array):
 
 
 def test_answers_are_the_heads_that_the_critic_prefers(policy: Policy, goals: jax.Array):
-    obs = jax.vmap(policy.env.relabel, (None, 0))(policy.env.start(policy.arm.home, goals[0]).obs, goals)
+    obs = jax.vmap(policy.env.replace_goal, (None, 0))(policy.env.start(policy.env.arm.home, goals[0]).obs, goals)
     action, _ = policy.agent.act(CONFIG, policy.networks.actor, policy.networks.critic, obs)
-    np.testing.assert_allclose(policy(goals).q, policy.arm.to_joints(action), atol=1e-6)
+    np.testing.assert_allclose(policy.solve(goals).q, policy.env.arm.to_joints(action), atol=1e-6)
 
 
 def test_asking_again_never_makes_an_answer_worse(policy: Policy, goals: jax.Array):
-    errors = [np.asarray(policy(goals, refine=n).error) for n in range(4)]
+    errors = [np.asarray(policy.solve(goals, corrections=n).errors["distance"]) for n in range(4)]
     for before, after in itertools.pairwise(errors):
         assert (after <= before).all()
     assert (errors[-1] < errors[0]).any()
@@ -59,7 +68,7 @@ def test_asking_again_never_makes_an_answer_worse(policy: Policy, goals: jax.Arr
 @pytest.mark.parametrize("refinements", [0, 3])
 def test_in_the_kinematic_setting_an_episode_is_the_refined_answer(policy: Policy, refinements: int):
     """There the arm is its forward model, and what an episode shows of an error is what the policy knows already."""
-    found, _ = evaluate.evaluate(policy, 50, refinements)
+    found = evaluate.evaluate(refined(policy, refinements), 50)
     assert found["episode"]["median_mm"] == pytest.approx(found["refined"]["median_mm"], rel=1e-3)
     assert found["episode"]["p95_mm"] == pytest.approx(found["refined"]["p95_mm"], rel=1e-3)
     same = found["refined"]["median_mm"] == found["one_shot"]["median_mm"]
@@ -67,7 +76,7 @@ def test_in_the_kinematic_setting_an_episode_is_the_refined_answer(policy: Polic
 
 
 def test_the_same_seed_asks_the_same(policy: Policy):
-    first, again, other = (evaluate.evaluate(policy, 50, 0, seed=seed) for seed in (3, 3, 4))
+    first, again, other = (evaluate.evaluate(refined(policy, 0), 50, seed=seed) for seed in (3, 3, 4))
     assert first == again
     assert first != other
 
@@ -76,7 +85,7 @@ def test_targets_that_fill_no_chunk_are_counted_exactly(policy: Policy, monkeypa
     """Progress goes to the last target, and a share of 130 targets is a multiple of 1 / 130."""
     monkeypatch.setattr(evaluate, "CHUNK", 50)
     told: list[int] = []
-    found, _ = evaluate.evaluate(policy, 130, 0, progress=told.append)
+    found = evaluate.evaluate(refined(policy, 0), 130, progress=told.append)
     assert told == [50, 100, 130]
     for share in found["one_shot"]["within"].values():
         assert share * 1.3 == pytest.approx(round(share * 1.3), abs=1e-9)
@@ -85,16 +94,16 @@ def test_targets_that_fill_no_chunk_are_counted_exactly(policy: Policy, monkeypa
 def test_a_policy_that_always_fails_is_not_accurate(policy: Policy):
     """An arm driven to NaN misses its target, whatever a median would say of NaN."""
     broken = replace(policy, networks=jax.tree.map(lambda p: p * jnp.nan, policy.networks))
-    found, _ = evaluate.evaluate(broken, 50, 0)
-    for accuracy in found.values():
+    found = evaluate.evaluate(refined(broken, 0), 50)
+    for accuracy in (found[name] for name in ("one_shot", "refined", "episode")):
         assert set(accuracy["within"].values()) == {0.0}
 
 
 def test_accuracy_counts():
     errors = np.array([0.5, 1.0, 4.0, 9.0, 15.0, 30.0, np.inf, 2.0]) / 1e3
-    found = evaluate.accuracy(errors)
+    found = Error().summary(errors)
     assert found["within"] == {"1": 25.0, "5": 50.0, "10": 62.5, "20": 75.0}
     assert found["median_mm"] == pytest.approx(6.5)
     assert list(found) == ["median_mm", "p95_mm", "within"]
-    lines = evaluate.table({"one_shot": found}).splitlines()
+    lines = evaluate.tables(Reach.metrics, {"one_shot": found}).splitlines()
     assert lines[-1].startswith("| one_shot | 6.50 mm |") and "62.50 %" in lines[-1]

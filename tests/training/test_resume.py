@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from arm5dof.training.checkpoint import Checkpoints
-from arm5dof.training.run import Run, make_trainer
+from arm5dof.training.config import fixed
+from arm5dof.training.run import Run
 
 SETTINGS = (
     "--episodes 24 --num-envs 4 --evaluate-every 12 --checkpoint-every 4 --batch-size 64 --actor-width 32 --heads 2 "
@@ -24,10 +25,10 @@ def command(*arguments):
 
 
 def final_state(folder):
-    """Every array of the last checkpoint: networks, optimisers, replay, environments, keys, counters."""
+    """Every array of the last checkpoint: networks, optimizers, replay, environments, keys, counters."""
     run = Run.open(folder)
-    trainer = make_trainer(run.config)
-    state = Checkpoints(folder / "checkpoints").restore(trainer.like)
+    trainer = run.trainer()
+    state = Checkpoints(folder / "checkpoints", fixed(run.config)).restore(trainer.like)
     assert int(state.steps) == trainer.total_steps
     raw = lambda x: jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x
     return {jax.tree_util.keystr(k): np.asarray(raw(v)) for k, v in jax.tree_util.tree_leaves_with_path(state)}

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from arm5dof.arm.arm import Pose
+
 
 class Link(NamedTuple):
     """One row of Table 1: offset `d` and length `a` in metres, twist `alpha` in radians.
@@ -30,15 +32,9 @@ TABLE_1 = (
 D1, A3, A4, D5 = TABLE_1[0].d, TABLE_1[2].a, TABLE_1[3].a, TABLE_1[4].d
 
 
-class Pose(NamedTuple):
-    """End effector in the base frame: position (..., 3) in metres, rotation (..., 3, 3) with columns n, o and a."""
-
-    position: jax.Array
-    rotation: jax.Array
-
-
 def forward(theta: jax.Array) -> Pose:
-    """Direct geometric model: joint angles (..., 5) in radians to the pose of DH frame 5.
+    """Direct geometric model: joint angles (..., 5) in radians to the pose of DH frame 5 in the base frame, whose
+    rotation has the columns n, o and a.
 
     The twelve equations that the paper prints below Eq. 6, which are right. Computes in the dtype it is given:
     float32, or float64 where JAX has it enabled.

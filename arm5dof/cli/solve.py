@@ -1,0 +1,209 @@
+"""`arm5dof solve`: how a goal is stated, and in which units answers are off, is the task's to say."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arm5dof.cli.parser import Parser, natural, nothing_left
+from arm5dof.errors import UserError
+from arm5dof.runtime import files
+
+if TYPE_CHECKING:
+    from arm5dof.envs import ForwardModel
+    from arm5dof.envs.metrics import Error
+
+HELP = """\
+Ask a trained policy for joint angles.
+
+  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the arm's base frame
+  arm5dof solve runs/reach --target 0.1 0 0.2 --target ...  several
+  arm5dof solve runs/reach --csv points.csv --out answers.csv
+  arm5dof solve runs/reach --help                           how a goal is stated to this run's policy
+
+A CSV has a header with x, y and z, and whatever else the run's task wants to know. Exit status 2 if a target is not
+reached within the tolerances.
+"""
+
+Inputs = dict[str, list[list[float]]]
+"""What people state of n goals: rows of numbers by the names of the task's goal inputs."""
+
+
+def declare(commands: argparse._SubParsersAction) -> None:
+    """Add `solve` to the commands."""
+    usage = "arm5dof solve RUN (--target X Y Z ... | --csv IN.csv [--out OUT.csv]) [options]"
+    raw = argparse.RawDescriptionHelpFormatter
+    p = commands.add_parser(
+        "solve",
+        help="ask a policy for joint angles",
+        usage=usage,
+        description=HELP,
+        formatter_class=raw,
+        add_help=False,
+    )
+    # RUN is not declared: beside targets, which only the run's task knows, it would swallow their numbers.
+    p.add_argument("-h", "--help", action="store_true", help="show this help, with RUN that of its task")
+    p.add_argument("--csv", type=Path, metavar="IN.csv", help="many targets")
+    p.add_argument("--out", type=Path, metavar="OUT.csv", help="with --csv: where the answers go; default: printed")
+    p.add_argument("--refine", type=natural, default=10, metavar="N", help="correct the target N times; default 10")
+    p.add_argument("--json", action="store_true", help="print a JSON list")
+    p.set_defaults(run=run, parser=p)
+
+
+def run(args: argparse.Namespace, rest: list[str]) -> None:
+    """`arm5dof solve`."""
+    folder, rest = _run_folder(rest)
+    if folder is None:
+        if args.help:
+            args.parser.print_help()
+            args.parser.exit()
+        raise UserError("name the run whose policy is to answer: arm5dof solve RUN --target X Y Z")
+    if args.out is not None and args.out.exists():
+        raise UserError(f"{args.out} exists: choose another --out")
+
+    from arm5dof.training.run import Run
+
+    policy = Run.open(folder).policy()
+    model = policy.forward_model
+    units = model.components
+    if args.help:
+        _declare_goal(args.parser, model, units)
+        args.parser.print_help()
+        args.parser.exit()
+    parser = Parser(prog="arm5dof solve", add_help=False)
+    _declare_goal(parser, model, units)
+    more, rest = parser.parse_known_args(rest)
+    nothing_left(rest)
+    inputs = _inputs(args.csv, vars(more), model)
+    tolerances = {name: getattr(more, f"tolerance_{unit.unit}") for name, unit in units.items()}
+
+    answer = policy.solve(corrections=args.refine, **inputs)
+    errors = {name: [unit.scale * float(v) for v in answer.errors[name]] for name, unit in units.items()}
+    reached = [all(errors[name][i] <= tolerances[name] for name in units) for i in range(len(answer.q))]
+    rows: list[dict[str, Any]] = [
+        {
+            **{_key(name): values[i] for name, values in inputs.items()},
+            "joints_rad": dict(zip(model.joint_names, map(float, angles), strict=True)),
+            **{f"error_{units[name].unit}": values[i] for name, values in errors.items()},
+        }
+        for i, angles in enumerate(answer.q)
+    ]
+    if args.json:
+        print(json.dumps(rows))
+    elif args.csv is None:
+        print("\n".join(_line(row, inputs, units) for row in rows))
+    if args.csv is not None and not (args.json and args.out is None):
+        text = _csv(rows, inputs, reached, model, units)
+        sys.stdout.write(text) if args.out is None else files.write_text(args.out, text)
+    if not all(reached):
+        name = next(name for name in units if max(errors[name]) > tolerances[name])
+        worst = max(range(len(rows)), key=lambda i: errors[name][i])
+        point = ", ".join(f"{v:g}" for v in next(iter(inputs.values()))[worst])
+        limits = " and ".join(f"{tolerances[name]:g} {unit.unit}" for name, unit in units.items())
+        raise UserError(
+            f"{reached.count(False)} of {len(rows)} targets not reached within {limits}: ({point}) m is missed by "
+            f"{errors[name][worst]:.1f} {units[name].unit}; {model.workspace}"
+        )
+
+
+def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:
+    """The run, which is the one word that is neither an option nor a number, and the other words."""
+    words = [word for word in rest if not word.startswith("--") and not _is_number(word)]
+    nothing_left(words[1:])
+    return (Path(words[0]) if words else None), [word for word in rest if word not in words]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _declare_goal(parser: argparse.ArgumentParser, model: ForwardModel, units: Mapping[str, Error]) -> None:
+    """Add the options by which a goal of the task is stated, and the tolerances of its errors."""
+    group = parser.add_argument_group("goals of this run's task")
+    for name, parts in model.goal_inputs.items():
+        metavar = tuple(part.upper() for part in parts)
+        group.add_argument(
+            f"--{name}", type=float, nargs=len(parts), action="append", metavar=metavar, help="repeatable"
+        )
+    for unit in units.values():
+        default = unit.tolerance
+        option, about = f"--tolerance-{unit.unit}", f"what counts as reached; default {default:g}"
+        group.add_argument(option, type=float, default=default, metavar=unit.unit.upper(), help=about)
+
+
+def _inputs(path: Path | None, given: Mapping[str, Any], model: ForwardModel) -> Inputs:
+    """What the command line or a CSV states of the goals."""
+    names = list(model.goal_inputs)
+    options = " ".join(f"--{name} {' '.join(model.goal_inputs[name]).upper()}" for name in names)
+    stated = {name: given[name] for name in names if given[name] is not None}
+    if (path is None) != bool(stated):
+        raise UserError(f"give either {options} (metres) or --csv FILE")
+    if path is not None:
+        return _read_csv(path, model)
+    if len(stated) != len(names) or len({len(rows) for rows in stated.values()}) > 1:
+        raise UserError(f"give {options} for each goal")
+    return stated
+
+
+def _read_csv(path: Path, model: ForwardModel) -> Inputs:
+    """Goals from the columns of a file. Raises `UserError` on anything else."""
+    columns = [part for parts in model.goal_inputs.values() for part in parts]
+    wanted = f"{', '.join(columns[:-1])} and {columns[-1]}"
+    inputs: Inputs = {name: [] for name in model.goal_inputs}
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as handle:
+            reader = csv.DictReader(handle)
+            if not set(columns) <= set(reader.fieldnames or ()):
+                raise UserError(f"{path} needs a header with {wanted} (metres)")
+            for row in reader:
+                try:
+                    for name, parts in model.goal_inputs.items():
+                        inputs[name].append([float(row[part]) for part in parts])
+                except (TypeError, ValueError):
+                    raise UserError(f"{path}, line {reader.line_num}: {wanted} must be numbers") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path} is not a CSV file: {error}") from None
+    if not inputs[next(iter(inputs))]:
+        raise UserError(f"{path} holds no targets")
+    return inputs
+
+
+def _csv(
+    rows: list[dict[str, Any]], inputs: Inputs, reached: list[bool], model: ForwardModel, units: Mapping[str, Error]
+) -> str:
+    """The text of a file with a row for each answer: goal, joint angles in radians, errors and whether it counts."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    errors = [f"error_{unit.unit}" for unit in units.values()]
+    writer.writerow(
+        [*(p for parts in model.goal_inputs.values() for p in parts), *model.joint_names, *errors, "reached"]
+    )
+    for row, counts in zip(rows, reached, strict=True):
+        goal = [value for name in inputs for value in row[_key(name)]]
+        angles = [f"{value:.7f}" for value in row["joints_rad"].values()]
+        writer.writerow([*goal, *angles, *(f"{row[error]:.4f}" for error in errors), int(counts)])
+    return text.getvalue()
+
+
+def _line(row: Mapping[str, Any], inputs: Inputs, units: Mapping[str, Error]) -> str:
+    """An answer for people."""
+    goal = " ".join(f"{1e3 * v:.1f}" for v in row["target_m"]) + " mm"
+    goal += "".join(f", {name} {' '.join(f'{v:g}' for v in row[name])}" for name in inputs if name != "target")
+    angles = "  ".join(f"{name} {math.degrees(value):.2f}" for name, value in row["joints_rad"].items())
+    errors = "  ".join(f"{row[f'error_{unit.unit}']:.2f} {unit.unit}" for unit in units.values())
+    return f"{goal}:  {angles} degrees  error {errors}"
+
+
+def _key(name: str) -> str:
+    return "target_m" if name == "target" else name

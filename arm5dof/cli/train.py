@@ -1,0 +1,161 @@
+"""`arm5dof train`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arm5dof.errors import UserError
+
+if TYPE_CHECKING:
+    from arm5dof.training.config import Config, Field
+
+HELP = """\
+Train a policy.
+
+An EXPERIMENT is a TOML file, yours or one that ships; without one, reach.toml trains the paper's 5-DOF arm in MJX
+servo dynamics for the paper's 400 episodes of 160 steps, to answer "which joint angles reach this point?". A run leaves
+a folder with its configuration, its robot, metrics, checkpoints, a figure and report.md. Stop it whenever you like:
+--resume goes on from the last checkpoint and ends with the same bits.
+
+  arm5dof train                                     the default experiment, into runs/reach
+  arm5dof train kinematic.toml --seed 1 --out DIR   another one, another seed, into DIR
+  arm5dof train reach_pose.toml                     points and directions: which way the tool points
+  arm5dof train --arm my_arm.xml --site tool0       your own arm
+  arm5dof train my.toml                             your own task: [env] task = "my_module:MyTask"
+  arm5dof train --smoke                             a minute on a laptop, to see that everything works
+  arm5dof train --resume runs/reach                 go on with a run that was stopped
+  arm5dof train my.toml --help                      the settings of that experiment's task
+
+A resumed run may have other episodes, evaluate_every, checkpoint_every, targets and interim_targets in its config.toml;
+every other setting is as it was.
+"""
+
+SMOKE = {
+    "episodes": "20",
+    "num_envs": "20",
+    "evaluate_every": "20",
+    "checkpoint_every": "20",
+    "targets": "500",
+    "interim_targets": "500",
+    "updates_per_step": "32",
+}
+"""What `--smoke` sets, unless the command line sets it otherwise."""
+
+
+def declare(commands: argparse._SubParsersAction) -> None:
+    """Add `train` to the commands."""
+    # The experiment is not declared: next to settings that argparse does not know it would swallow their values.
+    usage = "arm5dof train [EXPERIMENT.toml] [--SETTING VALUE ...] [--out DIR] [--resume DIR] [--smoke]"
+    raw = argparse.RawDescriptionHelpFormatter
+    p = commands.add_parser(
+        "train", help="train a policy", usage=usage, description=HELP, formatter_class=raw, add_help=False
+    )
+    # Help lists the settings, and importing those takes JAX, so only help pays for it.
+    p.add_argument("-h", "--help", action="store_true", help="show this help, every setting included")
+    p.add_argument("--out", type=Path, metavar="DIR", help="the run's folder; default: runs/<experiment>")
+    p.add_argument("--resume", type=Path, metavar="DIR", help="go on with the run in this folder")
+    p.add_argument("--smoke", action="store_true", help="a short run with small batches")
+    p.set_defaults(run=run, parser=p)
+
+
+def run(args: argparse.Namespace, rest: list[str]) -> None:
+    """`arm5dof train`."""
+    experiment, texts = _experiment_and_settings(rest)
+    if args.help:
+        _print_help(args.parser, experiment or "reach.toml")
+        args.parser.exit()
+    from arm5dof.runtime.progress import Bar
+    from arm5dof.training import run as runs
+    from arm5dof.training.checkpoint import silence_abandoned_writes
+    from arm5dof.training.evaluate import tables
+
+    silence_abandoned_writes()
+
+    if args.resume is not None:
+        others = [name for name, value in (("EXPERIMENT", experiment), ("--out", args.out)) if value]
+        others += [f"--{name}" for name in texts] + ["--smoke"] * args.smoke
+        if others:
+            raise UserError(f"--resume goes on with a run as it was configured; leave out {', '.join(others)}")
+        current = runs.Run.open(args.resume)
+        trainer = None
+    else:
+        experiment = experiment or "reach.toml"
+        out = args.out or runs.free_folder(Path(experiment).stem + ("-smoke" if args.smoke else ""))
+        if out.exists():
+            raise UserError(f"{out} exists: choose another --out, or go on with it by --resume {out}")
+        settings = _configure(experiment, texts, args.smoke)
+        # What is wrong with the robot or the budget is said before a folder exists.
+        trainer = runs.make_trainer(settings)
+        current = runs.Run.create(settings, out, trainer.env)
+    print(f"run {current.folder} on {runs.device()}", file=sys.stderr)
+    try:
+        with Bar("training", current.config.train.episodes, "episodes") as bar:
+            runs.resume(current, bar, trainer)
+    except UserError as error:
+        if args.resume is None:
+            raise UserError(f"{error} with arm5dof train --resume {current.folder}") from None
+        raise
+    print(tables(current.env.metrics, current.evaluations[-1]))
+    print(f"figure and report: {current.folder / 'report.md'}")
+
+
+def _configure(experiment: str, texts: dict[str, str], smoke: bool) -> Config:
+    """The configuration that a command line asks for."""
+    from arm5dof.training import config
+
+    fields = config.fields(config.load_config(experiment).task)
+    given = {_setting(name, fields).name for name in texts}
+    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
+    for name, value in texts.items():
+        if not value:
+            raise UserError(f"--{name} needs a value")
+    return config.load_config(experiment, **short, **texts)
+
+
+def _setting(name: str, fields: list[Field]) -> Field:
+    """The setting of that name, with options in what is said of a name that is none."""
+    from arm5dof.training import config
+
+    near = config.nearest(name.replace("-", "_"), [key for f in fields for key in (f.name, f"{f.section}.{f.name}")])
+    known = [f for f in fields if name.replace("-", "_") in (f.name, f"{f.section}.{f.name}")]
+    if not known:
+        hint = f"did you mean --{near.replace('_', '-')}?" if near else "see arm5dof train --help"
+        raise UserError(f"unknown option --{name}: {hint}")
+    return config.find(name, fields)
+
+
+def _experiment_and_settings(rest: list[str]) -> tuple[str | None, dict[str, str]]:
+    """An experiment's name, and `--setting value` or `--setting=value` pairs, in any order; the text is empty where
+    the value is missing."""
+    experiment, texts = None, {}
+    words = list(reversed(rest))
+    while words:
+        word = words.pop()
+        if not word.startswith("--"):
+            if experiment is not None:
+                raise UserError(f"unexpected argument {word!r} (see arm5dof train --help)")
+            experiment = word
+            continue
+        name, has_value, value = word[2:].partition("=")
+        if not has_value and words and not words[-1].startswith("--"):
+            value = words.pop()
+        texts[name] = value
+    return experiment, texts
+
+
+def _print_help(parser: argparse.ArgumentParser, experiment: str) -> None:
+    """Help that lists every setting of an experiment's task."""
+    from arm5dof.training import config
+
+    section = None
+    for f in config.fields(config.load_config(experiment).task):
+        if f.section != section:
+            section = f.section
+            group = parser.add_argument_group(f"settings [{section}]")
+        choices = f" One of {', '.join(f.choices)}." if f.choices else ""
+        text = f"{f.help}{choices} (default {f.default})"
+        group.add_argument(f"--{f.name.replace('_', '-')}", metavar="VALUE", help=text.replace("%", "%%"))
+    parser.print_help()
