@@ -169,7 +169,7 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
         ([tmp_path / "listed.txt"], "give one DETECTIONS.json and its --camera"),
         (
             [tmp_path / "found.json", *camera, "--tta", "--iou", 0.5],
-            "leave out --iou, --careful: that takes images",
+            "leave out --iou, --tta: that takes images",
         ),
         ([tmp_path / "found.json", *camera, "--out", tmp_path / "new"], "leave out --out: that takes images"),
         ([photo, *camera, "--out", tmp_path / "folder"], "folder exists: choose another --out"),
@@ -185,7 +185,7 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
             "small.png has 64x64 pixels and the camera 640x480",
         ),
         ([photo, *camera, "--height", "ball=0"], "give metres above zero"),
-        ([clip, *small, "--tta"], "is not the tabletop detector, which alone can look more carefully"),
+        ([clip, *small, "--tta"], "is not the tabletop detector, which alone has test-time augmentation"),
     ]:
         assert command(*words) == 2, expected
         captured = capfd.readouterr()
