@@ -1,4 +1,4 @@
-"""YOLOv5 in JAX beside the same weights in OpenCV: how fast, and how far apart.
+"""YOLOv5 in JAX beside the same weights in OpenCV: speed, and differences.
 
     python experiments/yolo.py DATA        a minute; into experiments/results/yolo.md
 
@@ -30,7 +30,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def in_turns(*calls: Callable[[], object]) -> list[list[float]]:
-    """Seconds of each call in each turn; one turn beforehand compiles."""
+    """Seconds that each call takes in each turn; one turn beforehand compiles."""
     times: list[list[float]] = [[] for _ in calls]
     for turn in range(TURNS + 1):
         for call, own in zip(calls, times, strict=True):
@@ -56,7 +56,7 @@ def main() -> None:
         sys.exit("usage: python experiments/yolo.py DATA")
     vision = Path(sys.argv[1]) / "vision"
     image = read(vision / "photos" / "bus.jpg")
-    rows, apart = [], []
+    speeds, differences = [], []
     load = os.getloadavg()[0]
     for size in SIZES:
         ours = YOLOv5(vision / "models" / "yolov5n.pt", size=size)
@@ -72,15 +72,15 @@ def main() -> None:
         def forward(ours=ours, square=square) -> list[np.ndarray]:
             return [np.asarray(x) for x in ours.forward(square)]
 
-        rows.append(compare(f"{size} x {size}, pixels to boxes and scores", opencv, forward))
-        rows.append(
+        speeds.append(compare(f"{size} x {size}, pixels to boxes and scores", opencv, forward))
+        speeds.append(
             compare(f"{size} x {size}, photograph to detections", lambda f=theirs: f(image), lambda f=ours: f(image))
         )
         output, (boxes, scores) = opencv(), forward()
         expected = output[:, 4:5] * output[:, 5:]
-        likely = expected.max(1) > 0.25
-        score, box = np.abs(scores - expected).max(), np.abs(boxes - output[:, :4])[likely].max()
-        apart.append(f"| {size} x {size} | {score:.4f} | {box:.2f} px |")
+        confident = expected.max(1) > 0.25
+        score, box = np.abs(scores - expected).max(), np.abs(boxes - output[:, :4])[confident].max()
+        differences.append(f"| {size} x {size} | {score:.4f} | {box:.2f} px |")
     text = "\n".join(
         [
             "# YOLOv5n in JAX and in OpenCV",
@@ -92,13 +92,13 @@ def main() -> None:
             "",
             "| | OpenCV | JAX | JAX / OpenCV |",
             "| --- | ---: | ---: | ---: |",
-            *rows,
+            *speeds,
             "",
             "Largest differences on the photograph: of all scores, and of the boxes with a score above 0.25.",
             "",
             "| | score | box |",
             "| --- | ---: | ---: |",
-            *apart,
+            *differences,
             "",
         ]
     )

@@ -7,15 +7,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision import boxes
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Boxes in an image, the most confident first. The fields are named as in the `supervision` library."""
+    """Boxes in an image, the most confident first. The fields are named as in the `supervision` library.
+
+    Raises `ValueError` for arrays of different lengths, values that are not finite, and unknown class ids.
+    """
 
     xyxy: np.ndarray
     """Left, top, right and bottom edges, (n, 4) float32, pixels: pixel i covers [i, i + 1)."""
@@ -40,13 +43,46 @@ class Detections:
             object.__setattr__(self, name, value[order])
         object.__setattr__(self, "class_names", tuple(self.class_names))
 
+    @classmethod
+    def from_scores(
+        cls,
+        cxcywh: np.ndarray,
+        scores: np.ndarray,
+        class_names: tuple[str, ...],
+        confidence: float,
+        iou: float,
+        limit: int = 300,
+    ) -> Detections:
+        """What is left of a YOLO network's output: each box with its best class, without the less confident ones and
+        those that non-maximum suppression removes, class by class.
+
+        Args:
+            cxcywh: Centers, widths and heights of boxes, (n, 4), pixels.
+            scores: Of each class, (n, classes).
+            class_names: Names of the classes.
+            confidence: Boxes with lower scores are dropped.
+            iou: Of boxes of one class that overlap more, the best stays.
+            limit: The largest number of detections.
+
+        Raises:
+            UserError: Boxes or scores are not finite.
+        """
+        if not (np.isfinite(cxcywh).all() and np.isfinite(scores).all()):
+            raise UserError("the network's output is not finite: its weights are damaged")
+        best = scores.argmax(1)
+        score = scores[np.arange(len(scores)), best]
+        rows = np.flatnonzero((score >= confidence) & (cxcywh[:, 2:] > 0).all(1))
+        xyxy, score, best = boxes.from_center_size(cxcywh[rows]), score[rows], best[rows]
+        kept = boxes.nms(xyxy, score, iou, best)[:limit]
+        return cls(xyxy[kept], score[kept], best[kept], class_names)
+
     def __len__(self) -> int:
         return len(self.confidence)
 
     def __getitem__(self, index: int | slice | np.ndarray) -> Detections:
         """Some of the boxes: by number, slice, or mask (n,)."""
-        pick = np.arange(len(self))[index].reshape(-1)
-        return Detections(self.xyxy[pick], self.confidence[pick], self.class_id[pick], self.class_names)
+        rows = np.arange(len(self))[index].reshape(-1)
+        return Detections(self.xyxy[rows], self.confidence[rows], self.class_id[rows], self.class_names)
 
     def __iter__(self) -> Iterator[Detections]:
         return (self[i] for i in range(len(self)))
@@ -57,17 +93,22 @@ class Detections:
         return {"class_name": np.array([self.class_names[i] for i in self.class_id], dtype=str)}
 
     @property
-    def centre(self) -> np.ndarray:
-        """Middles of the boxes, (n, 2), as OpenCV's camera model counts: whole numbers are the middles of pixels."""
+    def center(self) -> np.ndarray:
+        """Centers of the boxes, (n, 2), pixels, as OpenCV's camera model counts: whole numbers are centers of pixels.
+        That is half a pixel less than in `xyxy`."""
         return (self.xyxy[:, :2] + self.xyxy[:, 2:]) / 2 - 0.5
 
     def named(self, *names: str) -> Detections:
-        """The boxes of one class or several. Raises `UserError` if the detector knows none of such a name."""
+        """The boxes of one class or several.
+
+        Raises:
+            UserError: The detector does not know such a class.
+        """
         check_known(names, self.class_names)
         return self[np.isin(self.data["class_name"], names)]
 
     def rows(self) -> list[dict[str, Any]]:
-        """For each box its class, class id, confidence and edges in pixels, as JSON has them."""
+        """For JSON, of each box: `class_name`, `class_id`, `confidence`, and `xyxy`, its edges in pixels."""
         each = zip(self.data["class_name"], self.class_id, self.confidence, self.xyxy, strict=True)
         return [
             {
@@ -88,10 +129,11 @@ class Detector(Protocol):
     """Anything that finds objects of named classes in an image."""
 
     @property
-    def class_names(self) -> tuple[str, ...]: ...
+    def class_names(self) -> tuple[str, ...]:
+        """The classes, by their ids."""
 
     def __call__(self, image: np.ndarray) -> Detections:
-        """Detections in an RGB uint8 image (h, w, 3)."""
+        """What is in an RGB uint8 image (h, w, 3)."""
 
 
 def check_known(names: Iterable[str], class_names: Sequence[str]) -> None:
@@ -107,41 +149,3 @@ def check_thresholds(confidence: float, iou: float) -> None:
     for name, value in (("confidence", confidence), ("iou", iou)):
         if not 0 <= value <= 1:
             raise UserError(f"{name} must lie between 0 and 1, got {value}")
-
-
-def strongest(xyxy: np.ndarray, scores: np.ndarray, iou: float, group: np.ndarray | None = None) -> np.ndarray:
-    """Which of boxes (n, 4), left, top, right and bottom edges, are left, the highest score (n,) first, when of those
-    of one group (n,) that overlap more than `iou` only the best stays. Without groups all are of one."""
-    if not len(xyxy):
-        return np.empty(0, int)
-    # OpenCV moves groups apart by the largest coordinate, which is far enough only if none is negative.
-    corner = xyxy[:, :2] - xyxy[:, :2].min(0, initial=0)
-    whole = np.concatenate([corner, xyxy[:, 2:] - xyxy[:, :2]], axis=1)
-    group = np.zeros(len(xyxy), int) if group is None else group
-    return np.asarray(cv2.dnn.NMSBoxesBatched(whole.tolist(), scores.tolist(), group.tolist(), 0.0, iou), int)
-
-
-def suppress(
-    boxes: np.ndarray,
-    scores: np.ndarray,
-    class_names: tuple[str, ...],
-    confidence: float,
-    iou: float,
-    limit: int = 300,
-) -> Detections:
-    """Each box's best class, the boxes at least so confident, and of those of one class that overlap more than `iou`
-    the best.
-
-    boxes:  (n, 4) centre x and y, width, height, pixels
-    scores: (n, classes)
-    limit:  the largest number of detections
-    """
-    if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
-        raise UserError("the network's output is not finite: its weights are damaged")
-    best = scores.argmax(1)
-    score = scores[np.arange(len(scores)), best]
-    kept = np.flatnonzero((score >= confidence) & (boxes[:, 2:] > 0).all(1))
-    boxes, score, best = boxes[kept], score[kept], best[kept]
-    xyxy = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
-    chosen = strongest(xyxy, score, iou, best)[:limit]
-    return Detections(xyxy[chosen], score[chosen], best[chosen], class_names)

@@ -19,8 +19,17 @@ GREY = 114
 
 
 def read(path: str | Path) -> np.ndarray:
-    """An image file as RGB uint8 (h, w, 3), turned upright if its EXIF data say so. Raises `UserError` if there is no
-    such file or it is no image."""
+    """Read an image file, and turn it upright if its EXIF data say so.
+
+    Args:
+        path: A file of any format that OpenCV reads.
+
+    Returns:
+        RGB uint8 (h, w, 3).
+
+    Raises:
+        UserError: There is no such file, or it is damaged or no image.
+    """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"no image {path}: give the path of an image file")
@@ -39,14 +48,23 @@ def read(path: str | Path) -> np.ndarray:
 
 
 def rgb(array: np.ndarray) -> np.ndarray:
-    """An image as RGB uint8 (h, w, 3), from
+    """Convert an image to RGB uint8.
 
-    - grey (h, w) or (h, w, 1): repeated three times
-    - RGBA (h, w, 4): without its alpha, whatever lies beneath
-    - uint16: divided by 257, which takes the whole range to the whole range, and rounded
-    - floating point in [0, 1]: times 255, rounded
+    Args:
+        array: One of
 
-    Raises `UserError` for anything else; channels are never taken for BGR.
+            - grey (h, w) or (h, w, 1), which is repeated three times
+            - RGB (h, w, 3); channels are never taken for BGR
+            - RGBA (h, w, 4), whose alpha is dropped, whatever lies beneath
+
+            as uint8; as uint16, which is divided by 257, so that the whole range becomes the whole range, and rounded;
+            or as floating point in [0, 1], which is multiplied by 255 and rounded.
+
+    Returns:
+        RGB uint8 (h, w, 3), contiguous; the array itself if it is that already.
+
+    Raises:
+        UserError: It is anything else.
     """
     array = np.asarray(array)
     if array.ndim == 2:
@@ -70,9 +88,9 @@ def rgb(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Letterbox:
-    """An image shrunk or enlarged to fit a network's input, and the way back to its own pixels.
+    """An image resized to fit a network's input, and the way back to its own pixels.
 
-    Boxes are left, top, right, bottom (n, 4) in pixels, where pixel i covers [i, i + 1).
+    Boxes are left, top, right and bottom edges (n, 4), pixels, where pixel i covers [i, i + 1).
     """
 
     image: np.ndarray
@@ -89,7 +107,7 @@ class Letterbox:
         return np.asarray(xyxy, float) * np.tile(self._scale, 2) + np.tile(self.offset, 2)
 
     def to_source(self, xyxy: np.ndarray) -> np.ndarray:
-        """Boxes in this image, where they are in the source, cut off at its edges."""
+        """Boxes in this image, where they are in the source, clipped to its edges."""
         boxes = (np.asarray(xyxy, float) - np.tile(self.offset, 2)) / np.tile(self._scale, 2)
         return np.clip(boxes, 0, np.tile(self.source, 2))
 
@@ -99,11 +117,14 @@ class Letterbox:
 
 
 def letterbox(image: np.ndarray, size: tuple[int, int], stride: int | None = None) -> Letterbox:
-    """Fit an RGB uint8 image into `size` (width, height), keeping its aspect, between grey borders.
+    """Fit an image into a network's input, keeping its aspect ratio, between grey borders.
 
-    With a `stride` the borders are only as wide as it takes to make width and height multiples of it, as YOLOv5 does:
-    fewer pixels to look at, and another input shape for each aspect. Without, they fill up to `size`. An image that
-    needs neither is not copied.
+    Args:
+        image: RGB uint8 (h, w, 3). It is not copied if it fits as it is.
+        size: Width and height of the input, pixels.
+        stride: With it the borders are only as wide as it takes to make width and height multiples of it, as YOLOv5
+            does: fewer pixels to process, and another input shape for each aspect ratio. Without it they fill the
+            whole of `size`.
     """
     height, width = image.shape[:2]
     scale = min(size[0] / width, size[1] / height)

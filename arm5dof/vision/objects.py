@@ -1,8 +1,8 @@
-"""The things on the table: what they are called, what they are made of, and how high their middles lie.
+"""The catalogue of objects on the table: their names, what they are made of, and how high their centers lie.
 
-Every thing is symmetric about its middle, so that the middle of its outline is where its middle is seen, whichever way
-it is turned and wherever the camera stands: a box round it needs no correction. All are 20 to 40 mm wide where a
-gripper would take them.
+Every object is point-symmetric about its center, so that the center of its outline is where its center is seen,
+whichever way it is turned and wherever the camera stands: a box around it needs no correction. All are 20 to 40 mm wide
+where a gripper would take them.
 """
 
 from __future__ import annotations
@@ -18,36 +18,39 @@ UPRIGHT, ALONG_X = (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)
 
 @dataclass(frozen=True)
 class Part:
-    """One geom, in metres, where the thing's middle is the origin."""
+    """One geom. The origin is the object's center."""
 
     kind: mujoco.mjtGeom
     size: tuple[float, ...]
+    """As MJCF has it: half sizes or radii, metres."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Metres."""
     quaternion: tuple[float, float, float, float] = UPRIGHT
+    """w, x, y, z."""
 
 
 @dataclass(frozen=True)
-class Thing:
-    """A class of graspable things."""
+class CatalogueObject:
+    """A class of graspable objects."""
 
     name: str
     parts: tuple[Part, ...]
     half_height: float
-    """Of its middle above the table when it lies there, metres."""
+    """Height of its center above the table on which it lies, metres."""
     radius: float
-    """Of a circle round it as seen from above, metres."""
+    """Of a circle around it as seen from above, metres."""
     hue: float | None = None
-    """In degrees, for things told by their colour; None for those of any colour."""
+    """Degrees, for a class that is told by its color; None for objects of any color."""
     form: str = "block"
-    """How its outline changes with height: see `solid.Solid`."""
+    """How its outline changes with height: see `localization.solids.Solid`."""
 
 
-def _cube(name: str, hue: float) -> Thing:
-    return Thing(name, (Part(BOX, (0.0125, 0.0125, 0.0125)),), 0.0125, 0.0177, hue)
+def _cube(name: str, hue: float) -> CatalogueObject:
+    return CatalogueObject(name, (Part(BOX, (0.0125, 0.0125, 0.0125)),), 0.0125, 0.0177, hue)
 
 
 def _ring(radius: float, thickness: float, half_height: float, sides: int = 12) -> tuple[Part, ...]:
-    """A regular polygon with a hole: `radius` from the middle to the middle of a side."""
+    """A regular polygon with a hole: `radius` from the center to the middle of a side, metres."""
     middle = radius - thickness / 2
     half_side = radius * np.tan(np.pi / sides)
     angles = 2 * np.pi * np.arange(sides) / sides
@@ -65,12 +68,12 @@ def _ring(radius: float, thickness: float, half_height: float, sides: int = 12) 
 CATALOGUE = (
     _cube("red cube", 0.0),
     _cube("blue cube", 220.0),
-    Thing("ball", (Part(SPHERE, (0.015,)),), 0.015, 0.015, form="ball"),
-    Thing("can", (Part(CYLINDER, (0.0125, 0.02)),), 0.02, 0.0125),
-    Thing("brick", (Part(BOX, (0.02, 0.01, 0.01)),), 0.01, 0.0224),
-    Thing("ring", _ring(0.02, 0.01, 0.008), 0.008, 0.0207),
-    Thing("cross", (Part(BOX, (0.02, 0.007, 0.01)), Part(BOX, (0.007, 0.02, 0.01))), 0.01, 0.0212),
-    Thing(
+    CatalogueObject("ball", (Part(SPHERE, (0.015,)),), 0.015, 0.015, form="ball"),
+    CatalogueObject("can", (Part(CYLINDER, (0.0125, 0.02)),), 0.02, 0.0125),
+    CatalogueObject("brick", (Part(BOX, (0.02, 0.01, 0.01)),), 0.01, 0.0224),
+    CatalogueObject("ring", _ring(0.02, 0.01, 0.008), 0.008, 0.0207),
+    CatalogueObject("cross", (Part(BOX, (0.02, 0.007, 0.01)), Part(BOX, (0.007, 0.02, 0.01))), 0.01, 0.0212),
+    CatalogueObject(
         "dumbbell",
         (
             Part(CYLINDER, (0.005, 0.016), quaternion=ALONG_X),
@@ -82,8 +85,8 @@ CATALOGUE = (
         form="ball",
     ),
 )
-"""A detection's class id is a place in here."""
+"""A detection's class id is an index into it."""
 
-CLASS_NAMES = tuple(thing.name for thing in CATALOGUE)
-HALF_HEIGHTS = {thing.name: thing.half_height for thing in CATALOGUE}
-"""Metres from the table to the middle of a thing, by the name of its class."""
+CLASS_NAMES = tuple(one.name for one in CATALOGUE)
+HALF_HEIGHTS = {one.name: one.half_height for one in CATALOGUE}
+"""Height of an object's center above the table, metres, by the name of its class."""

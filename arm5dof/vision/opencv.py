@@ -1,4 +1,4 @@
-"""OpenCV kept quiet: what it warns of is checked here and said in one line of our own."""
+"""OpenCV without its log: what it warns of is checked here and said in one line of our own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without OpenCV's warnings, which may come by the dozen for each frame."""
+    """Silence OpenCV's warnings, which may come by the dozen for each frame."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

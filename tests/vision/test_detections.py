@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm5dof.errors import UserError
-from arm5dof.vision.detections import Detections, check_thresholds, strongest, suppress
+from arm5dof.vision.boxes import nms
+from arm5dof.vision.detections import Detections, check_thresholds
 
 NAMES = ("cube", "ball", "ring")
 
@@ -42,9 +43,9 @@ def test_some_of_them(three):
         three.named("cup")
 
 
-def test_centres_count_from_the_middle_of_the_first_pixel():
+def test_centers_count_from_the_middle_of_the_first_pixel():
     one_pixel = Detections([[3, 7, 4, 8]], [1], [0], NAMES)
-    np.testing.assert_array_equal(one_pixel.centre, [[3, 7]])
+    np.testing.assert_array_equal(one_pixel.center, [[3, 7]])
 
 
 def test_json(three):
@@ -73,7 +74,7 @@ def test_suppression_keeps_the_best_of_each_class(seed, n, threshold):
     random = np.random.default_rng(seed)
     boxes = np.concatenate([random.uniform(-20, 60, (n, 2)), random.uniform(5, 40, (n, 2))], axis=1)
     scores = random.uniform(0, 1, (n, 3))
-    found = suppress(boxes, scores, NAMES, 0.5, threshold)
+    found = Detections.from_scores(boxes, scores, NAMES, 0.5, threshold)
 
     corners = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
     best = scores.argmax(1)
@@ -85,30 +86,31 @@ def test_suppression_keeps_the_best_of_each_class(seed, n, threshold):
     np.testing.assert_allclose(found.xyxy, corners[expected].reshape(-1, 4), rtol=1e-5, atol=1e-5)
     np.testing.assert_array_equal(found.class_id, best[expected])
 
-    again = suppress(boxes[expected].reshape(-1, 4), scores[expected].reshape(-1, 3), NAMES, 0.5, threshold)
+    kept = boxes[expected].reshape(-1, 4), scores[expected].reshape(-1, 3)
+    again = Detections.from_scores(*kept, NAMES, 0.5, threshold)
     np.testing.assert_array_equal(again.xyxy, found.xyxy)
 
 
 def test_suppression_keeps_classes_apart_and_without_them_the_best_of_all():
     boxes, scores = np.array([[5, 5, 4, 4], [5, 5, 4, 5], [50, 5, 4, 4]]), np.array([[0.6, 0], [0, 0.9], [0.7, 0]])
-    found = suppress(boxes, scores, ("cube", "ball"), 0.25, 0.45)
+    found = Detections.from_scores(boxes, scores, ("cube", "ball"), 0.25, 0.45)
     assert len(found) == 3
-    kept = strongest(found.xyxy, found.confidence, 0.45)
+    kept = nms(found.xyxy, found.confidence, 0.45)
     np.testing.assert_array_equal(found.class_id[kept], [1, 0])
 
 
 def test_suppression_of_nothing_of_flat_boxes_and_of_too_many():
-    assert len(suppress(np.empty((0, 4)), np.empty((0, 3)), NAMES, 0.25, 0.45)) == 0
+    assert len(Detections.from_scores(np.empty((0, 4)), np.empty((0, 3)), NAMES, 0.25, 0.45)) == 0
     flat = np.array([[5, 5, 0, 3], [5, 5, 3, -1]])
-    assert len(suppress(flat, np.ones((2, 3)), NAMES, 0.25, 0.45)) == 0
+    assert len(Detections.from_scores(flat, np.ones((2, 3)), NAMES, 0.25, 0.45)) == 0
     apart = np.array([[10.0 * i, 5, 4, 4] for i in range(20)])
-    few = suppress(apart, np.linspace(0.5, 0.9, 20)[:, None], ("cube",), 0.25, 0.45, limit=3)
+    few = Detections.from_scores(apart, np.linspace(0.5, 0.9, 20)[:, None], ("cube",), 0.25, 0.45, limit=3)
     np.testing.assert_allclose(few.confidence, np.linspace(0.5, 0.9, 20)[:-4:-1], rtol=1e-6)
 
 
 def test_what_is_not_finite_is_refused():
     with pytest.raises(UserError, match="not finite"):
-        suppress(np.array([[5, 5, np.nan, 3]]), np.ones((1, 3)), NAMES, 0.25, 0.45)
+        Detections.from_scores(np.array([[5, 5, np.nan, 3]]), np.ones((1, 3)), NAMES, 0.25, 0.45)
     with pytest.raises(UserError, match="iou"):
         check_thresholds(0.5, 1.2)
     with pytest.raises(UserError, match="confidence"):

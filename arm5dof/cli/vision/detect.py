@@ -20,11 +20,11 @@ Find objects of named classes in images.
 SOURCE is a photograph, several, folders of them, a video, or a camera by its number: 0 is the first; or simulated, for
 random scenes such as the shipped detector was trained for, simulated:20 for 20 of them.
 
-The shipped detector finds the things of our catalogue on a table. MODEL is a file with another:
+The shipped detector finds the objects of our catalogue on a table. MODEL is a file with another:
 
   .pt     YOLOv5's own weights (n, s, m, l, x, release 6 and later), or what was trained from them with that code; run
           in JAX. The file is read without PyTorch, and nothing that it says is run.
-  .onnx   YOLOv5, v7, v8, v11 or YOLOX exported as ONNX, without suppression; run by OpenCV.
+  .onnx   YOLOv5, v7, v8, v11 or YOLOX exported as ONNX, without non-maximum suppression; run by OpenCV.
   .npz    weights of our detector, as arm5dof vision train writes them.
 
   arm5dof vision detect simulated --out found
@@ -37,7 +37,7 @@ Without --out a table is printed. With it a new folder gets the images, or the v
 and detections.json: a list with an object for each frame, {"name", "time_s", "image_size", "detections"}, and in that
 for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
 
-Faster: a smaller --size. Too little is found: --careful, or a lower --confidence; too much: a higher one. One thing is
+Faster: a smaller --size. Too little is found: --tta, or a lower --confidence; too much: a higher one. One object is
 found twice: a lower --iou.
 
 If an image is damaged, a video breaks off or you press Ctrl-C, the frames before are written and the files are whole;
@@ -55,27 +55,27 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.set_defaults(run=run)
 
 
-def run(known: argparse.Namespace, rest: list[str]) -> int:
+def run(args: argparse.Namespace, rest: list[str]) -> int:
     """`arm5dof vision detect`."""
     options.nothing_left(rest, "detect")
 
     from arm5dof.vision.io.sources import open_source
 
-    source = open_source(known.source)
-    return detecting.run(known, source, _outputs(known, source))
+    source = open_source(args.source)
+    return detecting.run(args, source, _outputs(args, source))
 
 
 @contextmanager
-def _outputs(known: argparse.Namespace, source: Source) -> Iterator[list[Write]]:
+def _outputs(args: argparse.Namespace, source: Source) -> Iterator[list[Write]]:
     """What the command line asks for."""
-    from arm5dof.vision.io import sinks as outputs
+    from arm5dof.vision.io import sinks
 
     with ExitStack() as stack:
-        asked = []
-        if known.out is not None:
-            asked.append(stack.enter_context(outputs.folder(known.out, source)))
-        if known.json:
-            asked.append(stack.enter_context(outputs.json_list(sys.stdout)))
-        elif known.out is None:
-            asked.append(stack.enter_context(outputs.table(sys.stdout)))
-        yield asked
+        writers = []
+        if args.out is not None:
+            writers.append(stack.enter_context(sinks.folder(args.out, source)))
+        if args.json:
+            writers.append(stack.enter_context(sinks.json_list(sys.stdout)))
+        elif args.out is None:
+            writers.append(stack.enter_context(sinks.table(sys.stdout)))
+        yield writers

@@ -21,45 +21,53 @@ if TYPE_CHECKING:
 
 
 def add_options(p: argparse.ArgumentParser) -> None:
-    """Which detector, what it is to find, and where that goes."""
+    """Add what says which detector runs, what it is to find, and where that goes."""
     p.add_argument("--detector", type=Path, metavar="MODEL", help="a .pt, .onnx or .npz file; default: what ships")
     p.add_argument("--names", type=Path, metavar="FILE", help="names of the classes, one a line; default: the model's")
     p.add_argument("--classes", type=_list, metavar="A,B,...", help="what to look for; default: every class")
-    p.add_argument("--confidence", type=float, default=0.25, metavar="P", help="how sure to be, 0 to 1; default 0.25")
     p.add_argument(
-        "--iou", type=float, default=0.45, metavar="P", help="overlap at which boxes of a class are one; default 0.45"
+        "--confidence", type=float, default=0.25, metavar="P", help="the least confidence, 0 to 1; default 0.25"
+    )
+    p.add_argument(
+        "--iou", type=float, default=0.45, metavar="P", help="IoU above which boxes of a class are one; default 0.45"
     )
     p.add_argument(
         "--size", type=int, metavar="PIXELS", help="side of the network's input; default: the model's, or 640"
     )
-    p.add_argument("--careful", action="store_true", help="the shipped detector looks three times, in twice the time")
+    p.add_argument("--tta", action="store_true", help="test-time augmentation of the shipped detector: twice the time")
     p.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder for what was found")
 
 
-def given(known: argparse.Namespace) -> list[str]:
+def given(args: argparse.Namespace) -> list[str]:
     """Which of these options are not as they are by default."""
     p = argparse.ArgumentParser(add_help=False)
     add_options(p)
-    return [f"--{name}" for name, default in vars(p.parse_args([])).items() if getattr(known, name) != default]
+    return [f"--{name}" for name, default in vars(p.parse_args([])).items() if getattr(args, name) != default]
 
 
-def run(known: argparse.Namespace, source: Source, outputs: AbstractContextManager[list[Write]]) -> int:
-    """Detect in all frames as the options say and hand each on to the outputs; gives the exit status. Raises
-    `UserError` where it cannot go on; what came before is kept."""
-    if known.out is not None and known.out.exists():
-        raise UserError(f"{known.out} exists: choose another --out")
+def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManager[list[Write]]) -> int:
+    """Detect in all frames as the options say and hand each on to the outputs.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        UserError: It cannot go on; what came before is kept.
+    """
+    if args.out is not None and args.out.exists():
+        raise UserError(f"{args.out} exists: choose another --out")
 
     import numpy as np
 
     from arm5dof.runtime.progress import Bar
-    from arm5dof.vision.detectors.loading import detect, load, read_names
+    from arm5dof.vision.detectors.loading import detect, load_detector, read_names
 
-    names = None if known.names is None else read_names(known.names)
-    failure, seen, done, started = None, Counter[str](), 0, time.monotonic()
+    names = None if args.names is None else read_names(args.names)
+    failure, total, done, started = None, Counter[str](), 0, time.monotonic()
     with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
         bar.update(0, "reading the detector")
-        detector = load(known.detector, names, known.confidence, known.iou, known.size, known.careful)
-        results = detect(source.frames, detector, known.classes)
+        detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta)
+        results = detect(source.frames, detector, args.classes)
         bar.update(0, "starting")
         if source.live:  # A camera shall not wait while the program for the first image is compiled.
             detector(np.zeros((480, 640, 3), np.uint8))
@@ -69,9 +77,9 @@ def run(known: argparse.Namespace, source: Source, outputs: AbstractContextManag
                     for write in writers:
                         write(frame, found)
                     done += 1
-                    here = Counter(found.data["class_name"].tolist())
-                    seen += here
-                    bar.update(done, _counted(here))
+                    in_frame = Counter(found.data["class_name"].tolist())
+                    total += in_frame
+                    bar.update(done, _counted(in_frame))
                     if interrupts:
                         break
             except UserError as error:
@@ -79,16 +87,16 @@ def run(known: argparse.Namespace, source: Source, outputs: AbstractContextManag
                     raise
                 failure = error
     frames = "1 frame" if done == 1 else f"{done} frames"
-    kept = f"{frames} before that {'printed' if known.out is None else f'in {known.out}'}"
+    kept = f"{frames} before that {'printed' if args.out is None else f'in {args.out}'}"
     if failure is not None:
         raise UserError(f"{failure}; {kept}")
     if interrupts and not source.live:
         print(f"arm5dof: interrupted; {kept}", file=sys.stderr)
         return 130
-    if not known.json:
-        print(f"{frames} in {time.monotonic() - started:.1f} s: {_counted(seen)}")
-        if known.out is not None:
-            print(f"written: {known.out}")
+    if not args.json:
+        print(f"{frames} in {time.monotonic() - started:.1f} s: {_counted(total)}")
+        if args.out is not None:
+            print(f"written: {args.out}")
     return 0
 
 
@@ -98,12 +106,12 @@ def interruptible() -> Iterator[list[int]]:
     interrupts: list[int] = []
     before = signal.getsignal(signal.SIGINT)
 
-    def ask(number: int, _: object) -> None:
+    def interrupt(number: int, _: object) -> None:
         interrupts.append(number)
         signal.signal(signal.SIGINT, before)
 
     if before is signal.default_int_handler:  # It is another where Ctrl-C is to be ignored, as in the background.
-        signal.signal(signal.SIGINT, ask)
+        signal.signal(signal.SIGINT, interrupt)
     try:
         yield interrupts
     finally:

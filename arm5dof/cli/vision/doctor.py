@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from arm5dof.vision.evaluation.doctor import Finding
 
 HELP = """\
-Say what works here: what can draw simulated pictures, and which detectors run. Each line was tried: pictures are drawn
+Say what works here: what can render simulated images, and which detectors run. Each line was tried: images are rendered
 and compared, networks are run. Where something does not work the line below says what to do.
 
-Nothing needs OpenGL. Software draws the same, more slowly, and is used where OpenGL does not work.
+Nothing needs OpenGL. Software renders the same, more slowly, and is used where OpenGL does not work.
 """
 
 
@@ -31,7 +31,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.set_defaults(run=run)
 
 
-def run(known: argparse.Namespace, rest: list[str]) -> None:
+def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision doctor`."""
     options.nothing_left(rest, "doctor")
     broken = _broken_choice()
@@ -43,13 +43,13 @@ def run(known: argparse.Namespace, rest: list[str]) -> None:
     with quiet():
         for title, findings in (("rendering", doctor.rendering(broken)), ("detectors", doctor.detectors())):
             report[title] = []
-            if not known.json:
+            if not args.json:
                 print(title)
             for finding in findings:
                 report[title].append(finding)
-                if not known.json:
+                if not args.json:
                     _show(finding)
-    if known.json:
+    if args.json:
         print(json.dumps({title: [asdict(f) for f in findings] for title, findings in report.items()}))
 
 

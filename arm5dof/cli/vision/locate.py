@@ -17,8 +17,9 @@ from arm5dof.errors import UserError
 if TYPE_CHECKING:
     from arm5dof.vision.camera import Camera
     from arm5dof.vision.detections import Detections
+    from arm5dof.vision.frames import Frame
     from arm5dof.vision.io.sinks import Write
-    from arm5dof.vision.io.sources import Frame, Source
+    from arm5dof.vision.io.sources import Source
     from arm5dof.vision.localization.locate import Located
 
 HELP = """\

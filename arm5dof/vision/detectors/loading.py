@@ -1,9 +1,9 @@
-"""Detectors by the name of their file, and what they find in frames:
+"""Detectors by the names of their files, and what they find in frames:
 
-    for frame, found in detect(open_source(["clip.mp4"]).frames, load("yolov5n.pt"), ["person"]):
+    for frame, found in detect(open_source(["clip.mp4"]).frames, load_detector("yolov5n.pt"), ["person"]):
         print(frame.time, found.xyxy)
 
-with `open_source` of `arm5dof.vision.sources`.
+with `open_source` of `arm5dof.vision.io.sources`.
 """
 
 from __future__ import annotations
@@ -13,64 +13,70 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 from arm5dof.vision.detections import Detections, Detector, check_known
-from arm5dof.vision.io.sources import Frame
-
-SHIPPED = files.PACKAGE / "vision" / "detectors" / "tabletop" / "tabletop.npz"
-"""Weights of the tabletop detector."""
+from arm5dof.vision.frames import Frame
 
 
-def load(
+def load_detector(
     path: str | Path | None = None,
     class_names: Sequence[str] | None = None,
     confidence: float = 0.25,
     iou: float = 0.45,
     size: int | None = None,
-    careful: bool = False,
+    tta: bool = False,
 ) -> Detector:
-    """The detector in a file: YOLOv5's own weights (`.pt`), a network of the YOLO family as ONNX (`.onnx`), or weights
-    of the tabletop detector (`.npz`). A file called otherwise is told by its content. Without one, what ships.
+    """Load the detector in a file, or the one that ships.
 
-    class_names: names of the network's classes; without them, those in the file
-    confidence:  detections below are dropped
-    iou:         of boxes of one class that overlap more, the best stays
-    size:        side of the network's input in pixels; without it the file's, or 640 where that leaves it open
-    careful:     see `TabletopDetector`, which alone can be so, and which takes neither names nor a size
+    Args:
+        path: YOLOv5's own weights (`.pt`), a network of the YOLO family as ONNX (`.onnx`), or weights of the tabletop
+            detector (`.npz`). A file with another suffix is recognized by its content. None for the tabletop detector
+            that ships.
+        class_names: Names of the network's classes; None for those in the file.
+        confidence: Detections below it are dropped, in [0, 1].
+        iou: Of boxes of one class that overlap more, the best stays, in [0, 1].
+        size: Side of the network's input, pixels; None for the file's, or 640 where that leaves it open.
+        tta: Test-time augmentation: see `TabletopDetector`, which alone has it, and which takes neither class names nor
+            a size.
 
-    Raises `UserError` if the file is none of these, is damaged, or tells apart another number of classes than are
-    named.
+    Returns:
+        A function from an RGB image to `Detections`.
+
+    Raises:
+        UserError: The file is none of these or is damaged, it has another number of classes than were named, or it does
+            not take an argument that was given.
+
+    Example:
+        >>> load_detector().class_names[:3]
+        ('red cube', 'blue cube', 'ball')
     """
-    path = SHIPPED if path is None else Path(path)
-    if not path.is_file():
+    if path is not None and not Path(path).is_file():
         raise UserError(f"no detector {str(path)!r}: give a .pt, .onnx or .npz file")
-    kind = _kind(path)
-    if careful and kind != ".npz":
-        raise UserError(
-            f"{path} is not the tabletop detector, which alone can look more carefully: leave --careful out"
-        )
     # Each takes its second to import, and only one is needed.
-    match kind:
-        case ".pt":
-            from arm5dof.vision.detectors.yolov5.model import YOLOv5
+    if path is None or (kind := _kind(Path(path))) == ".npz":
+        from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 
-            return YOLOv5(path, class_names, confidence, iou, 640 if size is None else size)
-        case ".onnx":
-            from arm5dof.vision.detectors.yolo_onnx import OnnxYOLO
+        if class_names is not None or size is not None:
+            raise UserError("the tabletop detector's class names and its size are fixed: leave them out")
+        return TabletopDetector(path, confidence, iou, tta)
+    if tta:
+        raise UserError(f"{path} is not the tabletop detector, which alone has test-time augmentation: leave tta out")
+    if kind == ".pt":
+        from arm5dof.vision.detectors.yolov5.model import YOLOv5
 
-            return OnnxYOLO(path, class_names, confidence, iou, size)
-        case ".npz":
-            from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
+        return YOLOv5(path, class_names, confidence, iou, 640 if size is None else size)
+    if kind == ".onnx":
+        from arm5dof.vision.detectors.yolo_onnx import OnnxYOLO
 
-            if class_names is not None or size is not None:
-                raise UserError(f"{path}: the tabletop detector's class names and its size are fixed: leave them out")
-            return TabletopDetector(path, confidence, iou, careful)
-        case _:
-            raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt), a network as ONNX (.onnx), or .npz")
+        return OnnxYOLO(path, class_names, confidence, iou, size)
+    raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt), a network as ONNX (.onnx), or .npz")
 
 
 def read_names(path: Path) -> list[str]:
-    """Names of classes from a text file with one in a line. Raises `UserError` if there are none, or it is no text."""
+    """Read names of classes from a text file with one in each line, in the order of their ids.
+
+    Raises:
+        UserError: There is no such file, it is no text, or a line of it is empty.
+    """
     try:
         names = path.read_text(encoding="utf-8-sig").strip().splitlines()
     except OSError as error:
@@ -85,9 +91,18 @@ def read_names(path: Path) -> list[str]:
 def detect(
     frames: Iterable[Frame], detector: Detector, classes: Sequence[str] | None = None
 ) -> Iterator[tuple[Frame, Detections]]:
-    """Each frame with what the detector finds in it, of all classes or those named.
+    """Run a detector on one frame after another.
 
-    Raises `UserError` at once if the detector does not know such a class, and later whatever the frames raise.
+    Args:
+        frames: Images, which are taken one at a time.
+        detector: What runs on them.
+        classes: Names of the classes to keep; None for all.
+
+    Returns:
+        An iterator of each frame and what was found in it. It raises whatever the frames raise.
+
+    Raises:
+        UserError: At once, if the detector does not know one of the classes.
     """
     if classes is None:
         return ((frame, detector(frame.image)) for frame in frames)

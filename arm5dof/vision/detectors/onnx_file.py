@@ -24,15 +24,20 @@ VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 
 @dataclass(frozen=True)
 class Description:
-    """Of a network in an ONNX file."""
+    """What an ONNX file says of its network."""
 
     inputs: tuple[tuple[int | None, ...], ...]
     """Shapes; None where the file leaves a length open."""
     metadata: dict[str, str]
+    """What its exporter wrote, such as the names of the classes."""
 
 
 def describe(path: Path) -> Description:
-    """Read an ONNX file's description. Raises `UserError` if there is no such file or it is damaged."""
+    """Read an ONNX file's description.
+
+    Raises:
+        UserError: There is no such file, or it is damaged.
+    """
     if not path.is_file():
         raise UserError(f"no file {path}: give an ONNX file")
     try:
@@ -42,13 +47,13 @@ def describe(path: Path) -> Description:
 
 
 def _model(message: memoryview) -> Description:
-    graphs = _all(message, MODEL_GRAPH)
+    graphs = _submessages(message, MODEL_GRAPH)
     if len(graphs) != 1:
         raise ValueError("it holds no network")
-    constants = {_text(tensor, TENSOR_NAME) for tensor in _all(graphs[0], GRAPH_INITIALIZER)}
+    constants = {_text(tensor, TENSOR_NAME) for tensor in _submessages(graphs[0], GRAPH_INITIALIZER)}
     # Old files list their weights among the inputs too.
-    inputs = [v for v in _all(graphs[0], GRAPH_INPUT) if _text(v, VALUE_NAME) not in constants]
-    entries = _all(message, MODEL_METADATA)
+    inputs = [v for v in _submessages(graphs[0], GRAPH_INPUT) if _text(v, VALUE_NAME) not in constants]
+    entries = _submessages(message, MODEL_METADATA)
     return Description(
         tuple(_shape(value) for value in inputs), {_text(e, ENTRY_KEY): _text(e, ENTRY_VALUE) for e in entries}
     )
@@ -56,20 +61,20 @@ def _model(message: memoryview) -> Description:
 
 def _shape(value: memoryview) -> tuple[int | None, ...]:
     for number in (VALUE_TYPE, TYPE_TENSOR, TENSOR_SHAPE):
-        found = _all(value, number)
+        found = _submessages(value, number)
         if len(found) != 1:
             raise ValueError("an input is no tensor")
         value = found[0]
-    lengths = [[n for number, n in _fields(dim) if number == DIM_VALUE] for dim in _all(value, SHAPE_DIM)]
+    lengths = [[n for number, n in _fields(dim) if number == DIM_VALUE] for dim in _submessages(value, SHAPE_DIM)]
     return tuple(n[0] if n and isinstance(n[0], int) and n[0] > 0 else None for n in lengths)
 
 
 def _text(message: memoryview, number: int) -> str:
-    found = _all(message, number)
+    found = _submessages(message, number)
     return bytes(found[0]).decode() if found else ""
 
 
-def _all(message: memoryview, number: int) -> list[memoryview]:
+def _submessages(message: memoryview, number: int) -> list[memoryview]:
     """Every field of that number that is bytes: a message or a text."""
     return [value for n, value in _fields(message) if n == number and isinstance(value, memoryview)]
 

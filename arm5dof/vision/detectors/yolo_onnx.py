@@ -1,10 +1,10 @@
 """Detectors of the YOLO family in ONNX files, run by OpenCV.
 
-What a network puts out is recognised by shape. With n cells in its grids (strides 8, 16, 32 and sometimes 64):
+A network's output is recognized by its shape. With n cells in its grids (strides 8, 16, 32 and sometimes 64):
 
-    YOLOv5, v7    (1, 3 n, 5 + classes)    centre, size, objectness, scores; three anchors in a cell
-    YOLOv8, v11   (1, 4 + classes, n)      centre, size, scores
-    YOLOX         (1, n, 5 + classes)      centre and log size in cells, objectness, scores; or decoded already
+    YOLOv5, v7    (1, 3 n, 5 + classes)    center, size, objectness, scores; three anchors in a cell
+    YOLOv8, v11   (1, 4 + classes, n)      center, size, scores
+    YOLOX         (1, n, 5 + classes)      center and log size in cells, objectness, scores; or decoded already
 
 OpenCV only warns where an input does not fit the network, and goes on with wrong numbers. So every network is tried
 once when it is loaded: its boxes must stand at their cells.
@@ -21,16 +21,16 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
-from arm5dof.vision.detections import Detections, check_thresholds, suppress
+from arm5dof.vision.detections import Detections, check_thresholds
 from arm5dof.vision.detectors import onnx_file
 from arm5dof.vision.images import GREY, check_size, letterbox, rgb
 from arm5dof.vision.opencv import quiet
 
 PYRAMIDS = ((8, 16, 32), (8, 16, 32, 64))
-"""Strides of the scales that such networks look at."""
+"""Strides of the scales that such networks have."""
 
-ASTRAY = {"yolov5": 1.5, "yolov8": 8, "yolox": 8}
-"""How far a box's centre may lie from the middle of its cell, in cells. YOLOv5's cannot be further away than 1,
+MAX_OFFSET = {"yolov5": 1.5, "yolov8": 8, "yolox": 8}
+"""How far a box's center may lie from the center of its cell, in cells. YOLOv5's cannot be further away than 1,
 YOLOv8's than 7.5; YOLOX sets no bound."""
 
 
@@ -40,44 +40,49 @@ class _Layout:
 
     name: str
     classes: int
-    middle: np.ndarray
-    """Middles of the rows' cells, (n, 2), pixels."""
+    center: np.ndarray
+    """Centers of the rows' cells, (n, 2), pixels."""
     stride: np.ndarray
     """Their widths, (n, 1), pixels."""
     raw: bool = False
-    """Whether centres and sizes are still in cells."""
+    """Whether centers and sizes are still in cells."""
 
     def blob(self, image: np.ndarray) -> np.ndarray:
         """The network's input for an RGB image. YOLOX was trained on BGR in [0, 255], the rest on RGB in [0, 1]."""
-        x = self.name == "yolox"
-        return cv2.dnn.blobFromImage(image, 1.0 if x else 1 / 255, swapRB=x)
+        yolox = self.name == "yolox"
+        return cv2.dnn.blobFromImage(image, 1.0 if yolox else 1 / 255, swapRB=yolox)
 
     def decode(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (n, 4), centre and size in pixels, and scores (n, classes)."""
+        """Boxes (n, 4), center and size in pixels, and scores (n, classes)."""
         rows = output[0].T if self.name == "yolov8" else output[0]
         boxes, scores = rows[:, :4], rows[:, 4:]
         if self.name != "yolov8":
             scores = scores[:, :1] * scores[:, 1:]
         if self.raw:
-            corner = self.middle - self.stride / 2
+            corner = self.center - self.stride / 2
             with np.errstate(over="ignore"):  # What overflows is found not to be finite.
                 boxes = np.concatenate([boxes[:, :2] * self.stride + corner, np.exp(boxes[:, 2:]) * self.stride], 1)
         return boxes, scores
 
-    def astray(self, output: np.ndarray) -> float:
-        """How far from the middles of their cells the boxes are, in cells, but for the worst twentieth."""
-        away = np.abs(self.decode(output)[0][:, :2] - self.middle) / self.stride
-        return float(np.quantile(away.max(1), 0.95))
+    def offset(self, output: np.ndarray) -> float:
+        """How far from the centers of their cells the boxes are, in cells, but for the worst twentieth."""
+        offset = np.abs(self.decode(output)[0][:, :2] - self.center) / self.stride
+        return float(np.quantile(offset.max(1), 0.95))
 
 
 class OnnxYOLO:
     """A detector with the network of an ONNX file.
 
-    path:        the file
-    class_names: names of the network's classes; without them, those that the file's metadata give
-    confidence:  detections below are dropped
-    iou:         of boxes of one class that overlap more, the best stays
-    size:        side of the square input in pixels, for a network that leaves it open (640 unless given)
+    Args:
+        path: The file.
+        class_names: Names of the network's classes; None for those in the file's metadata.
+        confidence: Detections below it are dropped, in [0, 1].
+        iou: Of boxes of one class that overlap more, the best stays, in [0, 1].
+        size: Side of the square input, pixels, for a network that leaves it open; None for 640.
+
+    Raises:
+        UserError: The file is missing, damaged, or holds no YOLO detector; it does not take an argument that was given;
+            or a threshold lies outside [0, 1].
     """
 
     def __init__(
@@ -100,17 +105,18 @@ class OnnxYOLO:
                 self._outputs = self._network.getUnconnectedOutLayersNames()
         except cv2.error as error:
             raise UserError(f"{path}: OpenCV cannot read this network ({_reason(error)}): export it anew") from None
-        self._layout = self._recognise()
+        self._layout = self._recognize()
 
     @property
     def class_names(self) -> tuple[str, ...]:
+        """The classes, by their ids."""
         return self._class_names
 
     def __call__(self, image: np.ndarray) -> Detections:
-        """Detections in an RGB uint8 image (h, w, 3)."""
+        """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
         boxed = letterbox(rgb(image), self._size)
         boxes, scores = self._layout.decode(self._forward(self._layout.blob(boxed.image)))
-        found = suppress(boxes, scores, self._class_names, self._confidence, self._iou)
+        found = Detections.from_scores(boxes, scores, self._class_names, self._confidence, self._iou)
         return replace(found, xyxy=boxed.to_source(found.xyxy))
 
     def _forward(self, blob: np.ndarray) -> np.ndarray:
@@ -130,7 +136,7 @@ class OnnxYOLO:
             raise UserError(f"{self._path} is no YOLO detector: its outputs have the shapes {shapes}")
         return flat[0].astype(np.float32)
 
-    def _recognise(self) -> _Layout:
+    def _recognize(self) -> _Layout:
         """The layout of the output for a grey image. Raises `UserError` if it is none that is known."""
         grey = np.full((self._size[1], self._size[0], 3), GREY, np.uint8)
         output = self._forward(cv2.dnn.blobFromImage(grey, 1 / 255))
@@ -138,7 +144,7 @@ class OnnxYOLO:
         if layout is None:
             raise UserError(
                 f"{self._path}: an output of shape {output.shape} for {self._size[0]} x {self._size[1]} pixels is none "
-                "of YOLOv5's, v7's, v8's, v11's or YOLOX's: export it without suppression, or give its size"
+                "of YOLOv5's, v7's, v8's, v11's or YOLOX's: export it without non-maximum suppression, or give its size"
             )
         if layout.classes != len(self._class_names):
             raise UserError(
@@ -149,11 +155,11 @@ class OnnxYOLO:
         if not np.isfinite(output).all():
             raise UserError(f"{self._path}: the network's output is not finite: its weights are damaged")
         if layout.name == "yolox":
-            layout = min(layout, replace(layout, raw=True), key=lambda either: either.astray(output))
+            layout = min(layout, replace(layout, raw=True), key=lambda layout: layout.offset(output))
         scores = layout.decode(output)[1]
         if scores.min() < -1e-3 or scores.max() > 1 + 1e-3:
             raise UserError(f"{self._path}: scores outside [0, 1]: export the network with its last sigmoid")
-        if layout.astray(output) > ASTRAY[layout.name]:
+        if layout.offset(output) > MAX_OFFSET[layout.name]:
             raise UserError(
                 f"{self._path}: boxes far from their cells: the network was exported for another size than "
                 f"{self._size[0]} x {self._size[1]} pixels, or with its coordinates scaled"
@@ -164,22 +170,22 @@ class OnnxYOLO:
 def _layout(shape: tuple[int, ...], size: tuple[int, int]) -> _Layout | None:
     for strides in PYRAMIDS:
         for name, anchors, rows, columns in (("yolov5", 3, 1, 2), ("yolov8", 1, 2, 1), ("yolox", 1, 1, 2)):
-            middle, stride = _cells(size, strides, anchors)
+            center, stride = _cells(size, strides, anchors)
             classes = shape[columns] - (4 if name == "yolov8" else 5)
-            if shape[rows] == len(middle) and classes > 0:
-                return _Layout(name, classes, middle, stride)
+            if shape[rows] == len(center) and classes > 0:
+                return _Layout(name, classes, center, stride)
     return None
 
 
 def _cells(size: tuple[int, int], strides: tuple[int, ...], anchors: int) -> tuple[np.ndarray, np.ndarray]:
-    """Middles (n, 2) and widths (n, 1) of every cell, by scale, anchor, row and column."""
-    middles, widths = [], []
+    """Centers (n, 2) and widths (n, 1) of every cell, by scale, anchor, row and column."""
+    centers, widths = [], []
     for stride in strides:
         x, y = np.meshgrid(np.arange(size[0] // stride), np.arange(size[1] // stride))
         grid = np.tile((np.stack([x, y], -1).reshape(-1, 2) + 0.5) * stride, (anchors, 1))
-        middles.append(grid)
+        centers.append(grid)
         widths.append(np.full((len(grid), 1), stride))
-    return np.concatenate(middles).astype(np.float32), np.concatenate(widths).astype(np.float32)
+    return np.concatenate(centers).astype(np.float32), np.concatenate(widths).astype(np.float32)
 
 
 def _input_size(path: Path, description: onnx_file.Description, size: int | None) -> tuple[int, int]:
@@ -203,7 +209,7 @@ def _names(path: Path, given: Sequence[str] | None, metadata: dict[str, str]) ->
     if given is not None:
         return tuple(given)
     if "names" not in metadata:
-        raise UserError(f"{path} does not say what its classes are called: give class_names (--names FILE)")
+        raise UserError(f"{path} does not say what its classes are called: give class_names")
     try:
         names = ast.literal_eval(metadata["names"])
         if isinstance(names, dict):
@@ -211,9 +217,7 @@ def _names(path: Path, given: Sequence[str] | None, metadata: dict[str, str]) ->
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError
     except (ValueError, SyntaxError, TypeError, KeyError, RecursionError, MemoryError):
-        raise UserError(
-            f"{path}: the class names in the file cannot be read: give class_names (--names FILE)"
-        ) from None
+        raise UserError(f"{path}: the class names in the file cannot be read: give class_names") from None
     return tuple(names)
 
 

@@ -17,31 +17,31 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision.detections import Detections, Detector
 from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
-from arm5dof.vision.evaluation.localization import Accuracy, Tally, edge_errors, look, place
+from arm5dof.vision.evaluation.localization import Accuracy, Tally, edge_errors, place, render_stereo_sample
 from arm5dof.vision.objects import CLASS_NAMES
 from arm5dof.vision.rendering.simulated import BackEnd
 from arm5dof.vision.synthetic.ground_truth import Truth
-from arm5dof.vision.synthetic.samples import in_order
+from arm5dof.vision.synthetic.samples import parallel_map
 
-UNSURE = 0.001
+PRECISION_CONFIDENCE = 0.001
 """Precision is averaged over all recalls, so it is measured with detections as uncertain as this."""
-SURE = 0.25
-"""Things are placed by detections at least so confident: what detectors report unless told otherwise."""
-TIMED = 100
-"""Pictures that the speed is measured on."""
-ROUNDS = 3
+POSITION_CONFIDENCE = 0.25
+"""Objects are located by detections at least so confident: what detectors report unless told otherwise."""
+TIMED_IMAGES = 100
+"""That the speed is measured on."""
+TIMED_ROUNDS = 3
 """How often; the fastest counts: what else the machine does only slows it down."""
 
 
 @dataclass(frozen=True)
 class Precision:
-    """Average precision, as COCO defines it: with whole boxes found where at least half of a thing is seen, and things
-    of which less is seen ignored."""
+    """Average precision, as COCO defines it: of objects of which at least half is seen; those of which less is seen are
+    ignored."""
 
     map50: float
-    """Mean over the classes, of boxes that overlap the true one by at least 50 %."""
+    """Mean over the classes, of boxes with an IoU of at least 50 % with the true one."""
     map50_95: float
-    """The same, and mean over overlaps of 50 %, 55 % to 95 %."""
+    """The same, and mean over an IoU of 50 %, 55 % to 95 %."""
     by_class: dict[str, float | None]
     """The latter of each class; None for classes that are nowhere."""
 
@@ -52,13 +52,14 @@ class Result:
 
     precision: Precision
     positions: dict[str, Accuracy]
-    """By the method: `plane`, `depth`, `two_views`."""
+    """By the method of localization: `plane`, `depth`, `two_views`."""
     edge_px: float
-    """Standard deviation of the edges of boxes, of things that are placed."""
+    """Standard deviation of the edges of boxes that find an object, pixels."""
     frames_per_s: float
     """Whole calls of the detector as it ships, image in, detections out."""
 
     def as_json(self) -> dict[str, Any]:
+        """All of it, for a JSON object."""
         return {
             "map50": self.precision.map50,
             "map50_95": self.precision.map50_95,
@@ -76,42 +77,63 @@ def evaluate(
     scenes: int,
     seed: int,
     back_end: BackEnd = "auto",
-    careful: bool = False,
-    progress: Callable[[int], None] = lambda done: None,
+    tta: bool = False,
+    progress: Callable[[int], object] = lambda done: None,
 ) -> Result:
-    """Of a file of weights, or those that ship, on `scenes` pictures in the style of evaluation."""
-    unsure, detector = (TabletopDetector(weights, least, careful=careful) for least in (UNSURE, SURE))
+    """Measure the tabletop detector on random scenes in the style of evaluation.
+
+    Args:
+        weights: A file of weights; None for those that ship.
+        scenes: Number of scenes.
+        seed: Of the scenes.
+        back_end: What renders them: see `simulated_camera`.
+        tta: Use test-time augmentation.
+        progress: Called with the number of scenes done.
+
+    Raises:
+        UserError: The weights cannot be used, pycocotools is not installed, or there is nothing to find in the scenes.
+    """
+    thresholds = PRECISION_CONFIDENCE, POSITION_CONFIDENCE
+    permissive, detector = (TabletopDetector(weights, confidence, tta=tta) for confidence in thresholds)
     truths: list[Truth] = []
-    found: list[Detections] = []
-    pictures: list[np.ndarray] = []
+    detections: list[Detections] = []
+    images: list[np.ndarray] = []
     tallies: dict[str, Tally] = defaultdict(Tally)
-    off: list[np.ndarray] = []
-    for done, seen in enumerate(in_order(partial(look, seed=seed, back_end=back_end), scenes), 1):
-        first = seen.views[0]
-        both = [unsure(view.picture) for view in seen.views]
+    errors: list[np.ndarray] = []
+    samples = parallel_map(partial(render_stereo_sample, seed=seed, back_end=back_end), scenes)
+    for done, sample in enumerate(samples, 1):
+        first = sample.views[0]
+        both = [permissive(view.picture) for view in sample.views]
         truths.append(first.truth)
-        found.append(both[0])
-        sure = [some[some.confidence >= SURE] for some in both]
-        off.append(edge_errors(sure[0], first.truth))
-        for method, located in place(seen, sure).items():
+        detections.append(both[0])
+        confident = [found[found.confidence >= POSITION_CONFIDENCE] for found in both]
+        errors.append(edge_errors(confident[0], first.truth))
+        for method, located in place(sample, confident).items():
             tallies[method].add(located, first.truth)
-        pictures += [first.picture] * (done <= TIMED)
+        images += [first.picture] * (done <= TIMED_IMAGES)
         progress(done)
     positions = {method: tally.accuracy() for method, tally in tallies.items()}
-    edge_px = float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
-    return Result(average_precision(truths, found), positions, edge_px, speed(detector, pictures))
+    edge_px = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+    return Result(average_precision(truths, detections), positions, edge_px, speed(detector, images))
 
 
-def average_precision(truths: Sequence[Truth], found: Sequence[Detections]) -> Precision:
-    """By pycocotools, from what there is and what was found in each picture. Raises `UserError` without pycocotools, or
-    if there is nothing to find."""
+def average_precision(truths: Sequence[Truth], detections: Sequence[Detections]) -> Precision:
+    """Average precision by pycocotools.
+
+    Args:
+        truths: What there is in each image.
+        detections: What was found in it, of classes of the catalogue.
+
+    Raises:
+        UserError: pycocotools is not installed, or there is nothing to find.
+    """
     try:
         from pycocotools.coco import COCO
         from pycocotools.cocoeval import COCOeval
     except ImportError:
-        raise UserError("average precision takes pycocotools: pip install 'arm5dof[eval]'") from None
+        raise UserError("average precision needs pycocotools: pip install 'arm5dof[eval]'") from None
     annotations: list[dict[str, Any]] = [
-        {"image_id": image, "category_id": int(class_id), "bbox": _corner_and_size(box), "iscrowd": int(not counts)}
+        {"image_id": image, "category_id": int(class_id), "bbox": _xywh(box), "iscrowd": int(not counts)}
         for image, truth in enumerate(truths)
         for box, class_id, counts in zip(truth.xyxy, truth.class_id, truth.counts, strict=True)
     ]
@@ -120,9 +142,9 @@ def average_precision(truths: Sequence[Truth], found: Sequence[Detections]) -> P
     for i, one in enumerate(annotations, 1):
         one |= {"id": i, "area": one["bbox"][2] * one["bbox"][3]}
     answers = [
-        {"image_id": image, "category_id": int(class_id), "bbox": _corner_and_size(box), "score": float(confidence)}
-        for image, some in enumerate(found)
-        for box, class_id, confidence in zip(some.xyxy, some.class_id, some.confidence, strict=True)
+        {"image_id": image, "category_id": int(class_id), "bbox": _xywh(box), "score": float(confidence)}
+        for image, found in enumerate(detections)
+        for box, class_id, confidence in zip(found.xyxy, found.class_id, found.confidence, strict=True)
     ]
     if not answers:
         return Precision(0.0, 0.0, dict.fromkeys(CLASS_NAMES, 0.0))
@@ -137,7 +159,7 @@ def average_precision(truths: Sequence[Truth], found: Sequence[Detections]) -> P
         result = COCOeval(coco, coco.loadRes(answers), "bbox")
         result.evaluate()
         result.accumulate()
-    # Overlaps, recalls, classes, sizes of things (all of them first), numbers of detections (100 last); -1 for none.
+    # IoU, recalls, classes, sizes of objects (all of them first), numbers of detections (100 last); -1 for none.
     precision = result.eval["precision"][:, :, :, 0, -1]
     precision = np.where(precision < 0, np.nan, precision)
     by_class = precision.mean((0, 1))
@@ -151,18 +173,19 @@ def average_precision(truths: Sequence[Truth], found: Sequence[Detections]) -> P
     )
 
 
-def speed(detector: Detector, pictures: Sequence[np.ndarray]) -> float:
-    """Pictures a second, one after the other."""
-    detector(pictures[0])
-    taken = []
-    for _ in range(ROUNDS):
+def speed(detector: Detector, images: Sequence[np.ndarray]) -> float:
+    """Images a second, one after the other."""
+    detector(images[0])
+    seconds = []
+    for _ in range(TIMED_ROUNDS):
         started = time.perf_counter()
-        for picture in pictures:
-            detector(picture)
-        taken.append(time.perf_counter() - started)
-    return len(pictures) / min(taken)
+        for image in images:
+            detector(image)
+        seconds.append(time.perf_counter() - started)
+    return len(images) / min(seconds)
 
 
-def _corner_and_size(box: np.ndarray) -> list[float]:
+def _xywh(box: np.ndarray) -> list[float]:
+    """As COCO has boxes: left, top, width and height."""
     left, top, right, bottom = (float(v) for v in box)
     return [left, top, right - left, bottom - top]

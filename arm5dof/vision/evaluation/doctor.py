@@ -1,7 +1,7 @@
-"""What can draw and what can detect on this machine, found out by doing it, and what to install for the rest.
+"""What can render and what can detect on this machine, found out by doing it, and what to install for the rest.
 
-OpenGL may end a process, so it draws in one of its own: `python -m arm5dof.vision.doctor LIBRARY` prints what it
-measured with one library.
+OpenGL may end a process, so it renders in one of its own, which runs this module with the name of one library and
+writes what it measured to standard output.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ import numpy as np
 from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 from arm5dof.vision.detectors.yolov5.layers import Conv
 from arm5dof.vision.evaluation.localization import pairs
-from arm5dof.vision.rendering import opengl as gl
+from arm5dof.vision.rendering import opengl
 from arm5dof.vision.rendering.software import SoftwareRenderer
-from arm5dof.vision.synthetic.samples import shoot
+from arm5dof.vision.synthetic.samples import render_sample
 from arm5dof.vision.synthetic.scene_builder import CAMERA
 from arm5dof.vision.synthetic.scenes import random_scene
 
 WIDTH, HEIGHT = 320, 240
 SIZE = f"{WIDTH} x {HEIGHT}"
 SCENES = 3
+"""That are rendered to compare back ends, and to detect in."""
 
 OPENCV = "pip uninstall opencv-python opencv-python-headless; pip install 'opencv-python-headless>=5'"
 
@@ -54,6 +55,7 @@ class Finding:
     """One line of the report."""
 
     what: str
+    """What was tried."""
     works: bool
     detail: str
     """What was measured, or what is wrong."""
@@ -62,15 +64,19 @@ class Finding:
 
 
 def rendering(broken: str | None = None) -> Iterator[Finding]:
-    """What can draw, one by one as it is found out, and which of it will; `broken` is what MUJOCO_GL said if MuJoCo
-    cannot be imported with it."""
+    """What can render, one by one as it is found out, and which of it is chosen.
+
+    Args:
+        broken: The value of MUJOCO_GL if MuJoCo cannot be imported with it.
+    """
     if broken is not None:
         yield Finding(f"MUJOCO_GL={broken}", False, "MuJoCo cannot be imported with it", "unset MUJOCO_GL")
     yield _software()
-    for library in gl.known():
+    for library in opengl.libraries():
         yield _opengl(library)
-    said = f" (MUJOCO_GL={os.environ['MUJOCO_GL']})" if "MUJOCO_GL" in os.environ else ""
-    yield Finding("chosen", True, (f"OpenGL by {gl.working()}" if gl.working() else "software") + said)
+    working, choice = opengl.working_library(), os.environ.get("MUJOCO_GL")
+    detail = f"OpenGL by {working}" if working else "software"
+    yield Finding("chosen", True, detail if choice is None else f"{detail} (MUJOCO_GL={choice})")
 
 
 def detectors() -> Iterator[Finding]:
@@ -82,37 +88,36 @@ def detectors() -> Iterator[Finding]:
 
 def _software() -> Finding:
     scene = random_scene(0)
-    camera = SoftwareRenderer(scene.model, CAMERA, WIDTH, HEIGHT)
+    renderer = SoftwareRenderer(scene.model, CAMERA, WIDTH, HEIGHT)
     try:
-        return Finding("software", True, f"{_milliseconds(lambda: camera.rgb(scene.data)):.0f} ms a picture of {SIZE}")
+        ms = _milliseconds(lambda: renderer.rgb(scene.data))
+        return Finding("software", True, f"{ms:.0f} ms an image of {SIZE}")
     except (AttributeError, cv2.error) as error:  # Another OpenCV hides ours, or has overwritten it.
         return Finding("software", False, f"OpenCV {cv2.__version__}: {' '.join(str(error).split())}", OPENCV)
 
 
 def _opengl(library: str) -> Finding:
-    what, wrong = f"OpenGL by {library}", gl.problem(library)
-    if wrong is None:
-        printed, wrong = gl.alone("arm5dof.vision.evaluation.doctor", library)
-        if wrong is None:
-            ms, difference, same = json.loads(printed)
-            seen = f"against software: colours {difference:.1f} of 255 apart, {same:.2%} of pixels show the same thing"
-            return Finding(what, True, f"{ms:.0f} ms; {seen}")
+    what, error = f"OpenGL by {library}", opengl.problem(library)
+    if error is None:
+        measured, error = opengl.run_isolated("arm5dof.vision.evaluation.doctor", library)
+        if error is None:
+            ms, difference, same = json.loads(measured)
+            against = f"colors {difference:.1f} of 255 from software's, {same:.2%} of pixels show the same geom"
+            return Finding(what, True, f"{ms:.0f} ms; {against}")
     remedies = [commands[library] for tool, commands in INSTALL.items() if library in commands and shutil.which(tool)]
-    return Finding(what, False, wrong, (*remedies, "not needed: software draws the same")[0])
+    return Finding(what, False, error, (*remedies, "not needed: software renders the same")[0])
 
 
 def _tabletop() -> Finding:
-    """What ships, on some pictures of what it was trained for."""
-    what, detector = "what ships", TabletopDetector()
-    shots = [shoot(number, 0, "evaluation", "software") for number in range(SCENES)]
-    there = found = 0
-    for shot in shots:
-        there += int(shot.truth.counts.sum())
-        found += len(pairs(detector(shot.picture), shot.truth)[0])
-    ms = _milliseconds(lambda: detector(shots[0].picture))
-    detail = f"found {found} of {there} things in {SCENES} simulated pictures, {ms:.1f} ms a picture of 640 x 480"
-    works = 2 * found > there
-    return Finding(what, works, detail, "" if works else "pip install --upgrade jax")
+    """The detector that ships, on some images of what it was trained for."""
+    detector = TabletopDetector()
+    samples = [render_sample(number, 0, "evaluation", "software") for number in range(SCENES)]
+    present = sum(int(sample.truth.counts.sum()) for sample in samples)
+    found = sum(len(pairs(detector(sample.image), sample.truth)[0]) for sample in samples)
+    ms = _milliseconds(lambda: detector(samples[0].image))
+    detail = f"found {found} of {present} objects in {SCENES} simulated images, {ms:.1f} ms an image of 640 x 480"
+    works = 2 * found > present
+    return Finding("what ships", works, detail, "" if works else "pip install --upgrade jax")
 
 
 def _yolov5() -> Finding:
@@ -127,7 +132,7 @@ def _yolov5() -> Finding:
     device = jax.devices()[0]
     detail = f"jax {jax.__version__} on {device.device_kind}, {_milliseconds(run):.1f} ms a layer"
     if error > 0.1:  # Accelerators round to 10 bits; sums of nine numbers reach 9.
-        return Finding("YOLOv5 weights (.pt)", False, f"{detail}, off by {error:.2g}", "pip install --upgrade jax")
+        return Finding("YOLOv5 weights (.pt)", False, f"{detail}, error {error:.2g}", "pip install --upgrade jax")
     return Finding("YOLOv5 weights (.pt)", True, detail)
 
 
@@ -156,12 +161,12 @@ def _milliseconds(run: Callable[[], object]) -> float:
 
 
 def _measure(library: str) -> tuple[float, float, float]:
-    """Milliseconds a picture by an OpenGL library, its mean difference from software of 255, and the share of pixels
+    """Milliseconds an image by an OpenGL library, its mean difference from software's of 255, and the share of pixels
     where the two see the same geom."""
     times, differences, same = [], [], []
     for number in range(SCENES):
         scene = random_scene(number)
-        theirs = gl.GLRenderer(scene.model, CAMERA, WIDTH, HEIGHT, library)
+        theirs = opengl.GLRenderer(scene.model, CAMERA, WIDTH, HEIGHT, library)
         ours = SoftwareRenderer(scene.model, CAMERA, WIDTH, HEIGHT)
         times.append(_milliseconds(lambda theirs=theirs, scene=scene: theirs.rgb(scene.data)))  # type: ignore[misc]
         differences.append(np.abs(theirs.rgb(scene.data).astype(int) - ours.rgb(scene.data)).mean())
@@ -170,4 +175,4 @@ def _measure(library: str) -> tuple[float, float, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(_measure(sys.argv[1])))
+    sys.stdout.write(json.dumps(_measure(sys.argv[1])))

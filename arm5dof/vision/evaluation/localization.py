@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from arm5dof.vision.boxes import iou
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.detectors.tabletop.proposals import overlap
 from arm5dof.vision.evaluation.simulated_calibration import rehearse
 from arm5dof.vision.localization.depth import by_depth
 from arm5dof.vision.localization.locate import Located, by_plane
@@ -58,14 +58,14 @@ class Accuracy:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class StereoSample:
     """A scene seen by two cameras, and how high its things are taken to be: heights vary, as things do."""
 
     views: tuple[View, View]
     solids: dict[str, Solid]
 
 
-def look(number: int, seed: int, back_end: BackEnd) -> Look:
+def render_stereo_sample(number: int, seed: int, back_end: BackEnd) -> StereoSample:
     """The scene of that number in a series, in the style of evaluation."""
     scene = random_scene((seed, number), "evaluation")
     rng = np.random.default_rng((seed, number))
@@ -80,10 +80,10 @@ def look(number: int, seed: int, back_end: BackEnd) -> Look:
         name: replace(solid, half_height=solid.half_height + solid.deviation * rng.normal())
         for name, solid in CATALOGUE_SOLIDS.items()
     }
-    return Look((views[0], views[1]), solids)
+    return StereoSample((views[0], views[1]), solids)
 
 
-def place(seen: Look, found: Sequence[Detections]) -> dict[str, Located]:
+def place(seen: StereoSample, found: Sequence[Detections]) -> dict[str, Located]:
     """Where the things found in both pictures are, by each method."""
     first, second = seen.views
     given = found[0], first.known, seen.solids
@@ -97,7 +97,7 @@ def place(seen: Look, found: Sequence[Detections]) -> dict[str, Located]:
 def pairs(found: Detections, there: Truth) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the things that count and were found, and of the boxes that found them, (n,) each. A thing is found by
     the box of its class that fits it best, if by half at least."""
-    fit = np.where(there.class_id[:, None] == found.class_id, overlap(there.xyxy, found.xyxy), 0.0)
+    fit = np.where(there.class_id[:, None] == found.class_id, iou(there.xyxy[:, None], found.xyxy), 0.0)
     things = np.flatnonzero(there.counts & (fit.max(1, initial=0) >= 0.5))
     return things, fit[things].argmax(1) if len(things) else things
 

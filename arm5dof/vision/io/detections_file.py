@@ -1,4 +1,4 @@
-"""Detections from JSON: a list of them as `Detections.to_json` writes it, or the frames that `vision detect` writes."""
+"""Detections as JSON, written and read: the frames of `as_json`, or one list of what `Detections.to_json` writes."""
 
 from __future__ import annotations
 
@@ -11,34 +11,53 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.vision.detections import Detections
+from arm5dof.vision.frames import Frame
 
 
-class Frame(NamedTuple):
-    """What was found in one picture."""
+class DetectedFrame(NamedTuple):
+    """What was found in one image."""
 
     name: str | None
     """None if the file does not tell."""
     size: tuple[int, int] | None
-    """Width and height; None if the file does not tell."""
+    """Width and height, pixels; None if the file does not tell."""
     detections: Detections
 
 
-def read(path: Path) -> list[Frame]:
-    """The frames in a file, or in what is piped in if it is called `-`. Raises `UserError` if it is none such."""
+def as_json(frame: Frame, detections: Detections) -> dict[str, Any]:
+    """What was found in one frame, for JSON: `name`; `time_s`, seconds since the beginning or None for a photograph;
+    `image_size`, width and height; and `detections`, as `Detections.rows` has them."""
+    height, width = frame.image.shape[:2]
+    time = None if frame.time is None else round(frame.time, 4)
+    return {"name": frame.name, "time_s": time, "image_size": [width, height], "detections": detections.rows()}
+
+
+def read(path: Path) -> list[DetectedFrame]:
+    """Read detections.
+
+    Args:
+        path: The file; `-` for what is piped in.
+
+    Returns:
+        Its frames; one without a name and size if it is a list of detections.
+
+    Raises:
+        UserError: It holds no detections.
+    """
     try:
         content = json.loads(sys.stdin.read() if str(path) == "-" else path.read_text(encoding="utf-8"))
         if not isinstance(content, list):
             raise TypeError
         if content and all("detections" in entry for entry in content):
             return [_frame(entry) for entry in content]
-        return [Frame(None, None, _detections(content))]
+        return [DetectedFrame(None, None, _detections(content))]
     except (ValueError, TypeError, KeyError, AttributeError):
         raise UserError(f"{path} holds no detections: give the JSON that arm5dof vision detect writes") from None
 
 
-def _frame(entry: dict[str, Any]) -> Frame:
+def _frame(entry: dict[str, Any]) -> DetectedFrame:
     width, height = entry["image_size"]
-    return Frame(str(entry["name"]), (int(width), int(height)), _detections(entry["detections"]))
+    return DetectedFrame(str(entry["name"]), (int(width), int(height)), _detections(entry["detections"]))
 
 
 def _detections(rows: list[dict[str, Any]]) -> Detections:

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from arm5dof.vision.io import sinks as outputs
+from arm5dof.vision.frames import Frame
+from arm5dof.vision.io import detections_file
 from arm5dof.vision.io.annotate import annotate
-from arm5dof.vision.io.sources import Frame
 from arm5dof.vision.localization.locate import Located
 
 
@@ -19,7 +19,7 @@ def as_json(name: str | None, found: Located) -> dict[str, Any]:
 
 def frame_as_json(frame: Frame, found: Located) -> dict[str, Any]:
     """The same where the frame is at hand: also what `vision detect` tells of it and of its boxes."""
-    told = outputs.as_json(frame, found.detections)
+    told = detections_file.as_json(frame, found.detections)
     boxes = told.pop("detections")
     return {**told, "things": [{**box, **row} for box, row in zip(boxes, found.rows(), strict=True)]}
 

@@ -18,8 +18,10 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.vision.detections import Detections
+from arm5dof.vision.frames import Frame
 from arm5dof.vision.io.annotate import annotate
-from arm5dof.vision.io.sources import IMAGE_SUFFIXES, USUAL_RATE, Frame, Source
+from arm5dof.vision.io.detections_file import as_json
+from arm5dof.vision.io.sources import IMAGE_SUFFIXES, USUAL_RATE, Source
 from arm5dof.vision.opencv import quiet
 
 Write = Callable[[Frame, Any], None]
@@ -28,14 +30,6 @@ Draw = Callable[[np.ndarray, Any], np.ndarray]
 """Takes an RGB uint8 image (h, w, 3) and what was found in it."""
 Show = Callable[[Frame, np.ndarray], None]
 """Takes a frame and its picture with the boxes drawn in."""
-
-
-def as_json(frame: Frame, found: Detections) -> dict[str, Any]:
-    """One frame: its name, seconds since the beginning (null for a photograph), width and height, and its detections,
-    the most confident first, with their edges in pixels: pixel i covers [i, i + 1)."""
-    height, width = frame.image.shape[:2]
-    time = None if frame.time is None else round(frame.time, 4)
-    return {"name": frame.name, "time_s": time, "image_size": [width, height], "detections": found.rows()}
 
 
 @contextmanager

@@ -9,17 +9,14 @@ import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.vision import images
+from arm5dof.vision.frames import Frame
 from arm5dof.vision.opencv import quiet
-
-if TYPE_CHECKING:
-    from arm5dof.vision.camera import Camera
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """What counts as a photograph in a folder; a file that is named may be called anything."""
@@ -36,20 +33,6 @@ TEXT = cv2.VideoWriter.fourcc(*"ansi")
 MISSING_S = 0.5
 """What may be missing at a video's end. What it states of its length is an estimate in some formats, and its sound may
 be a little longer than its pictures."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """An image, and what it is."""
-
-    name: str
-    """Of the file as it was given, or of the camera."""
-    image: np.ndarray
-    """RGB uint8 (h, w, 3)."""
-    time: float | None = None
-    """Seconds since the beginning of the video, or the camera's first frame; None for a photograph."""
-    camera: Camera | None = None
-    """What it was drawn for, known exactly; None for what a real camera took."""
 
 
 Frames = Generator[Frame, None, None]
@@ -164,11 +147,11 @@ def simulated(count: int) -> Source:
     """The first random scenes in the style of evaluation, 640 x 480. Raises `UserError` for none."""
     if count < 1:
         raise UserError("simulated:0 is no scene: ask for one or more")
-    from arm5dof.vision.synthetic.samples import shoot  # MuJoCo takes its time to import.
+    from arm5dof.vision.synthetic.samples import render_sample  # MuJoCo takes its time to import.
 
     names = (f"scene{number}.png" for number in range(count))
-    shots = ((name, shoot(number, 0, "evaluation", "auto")) for number, name in enumerate(names))
-    return Source((Frame(name, shot.picture, camera=shot.camera) for name, shot in shots), count, drawn=True)
+    samples = ((name, render_sample(number, 0, "evaluation", "auto")) for number, name in enumerate(names))
+    return Source((Frame(name, one.image, camera=one.camera) for name, one in samples), count, drawn=True)
 
 
 def _is_video(path: Path) -> bool:

@@ -138,7 +138,7 @@ def match(detections: tuple[Detections, Detections], cameras: tuple[Camera, Came
     first, second = detections
     rows = np.array([(i, j) for i in range(len(first)) for j in range(len(second))], int).reshape(-1, 2)
     i, j = rows.T
-    middles = np.stack([first.centre[i], second.centre[j]], axis=1)
+    middles = np.stack([first.center[i], second.center[j]], axis=1)
     _, apart = batched(lambda given, cameras: triangulate(cameras, given), middles, cameras)
     alike = first.data["class_name"][i] == second.data["class_name"][j]
     apart = np.where(alike & (apart <= limit), apart, np.inf).reshape(len(first), len(second))

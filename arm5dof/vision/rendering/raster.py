@@ -1,4 +1,4 @@
-"""`Raster`: OpenCV's triangle rasteriser as a camera, and the planes that it cannot draw."""
+"""`Raster`: OpenCV's triangle rasterizer as a camera, and the planes that it cannot draw."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ class Raster:
 
     A depth buffer (h, w) float32 holds 0 at the near plane and 1 at the far plane, as OpenGL's: between them it is
     linear in the inverse of the depth.
+
+    Args:
+        camera: The camera, with a pose.
+        near: Depth of the near plane, metres.
+        far: Depth of the far plane, metres.
     """
 
     def __init__(self, camera: Camera, near: float, far: float) -> None:
@@ -24,7 +29,7 @@ class Raster:
         (fx, _, cx), (_, fy, cy) = camera.matrix[:2]
         self._x = np.asarray((np.arange(camera.width) - cx) / fx, np.float32)
         self._y = np.asarray((np.arange(camera.height) - cy) / fy, np.float32)[:, None]
-        # The rasteriser's camera is OpenGL's, with square pixels and the principal point in the middle.
+        # The rasterizer's camera is OpenGL's, with square pixels and the principal point in the middle.
         self._axes = self._rotation * np.array([fx / fy, -1, -1], np.float32)
         self._field = 2 * np.arctan(camera.height / 2 / fy)
 
@@ -33,32 +38,38 @@ class Raster:
         return 1 / ((1 - buffer) * np.float32(1 / self._near) + buffer * np.float32(1 / self._far))
 
     def points(self, depth: np.ndarray) -> np.ndarray:
-        """What is seen at some depth (h, w) in metres, (h, w, 3), base frame."""
-        seen = cv2.merge([self._x * depth, self._y * depth, depth])
-        return np.asarray(cv2.transform(seen, np.c_[self._rotation, self.eye]))
+        """The points at which pixels look, (h, w, 3) in the base frame, from their depths (h, w), metres."""
+        local = cv2.merge([self._x * depth, self._y * depth, depth])
+        return np.asarray(cv2.transform(local, np.c_[self._rotation, self.eye]))
 
-    def meet(self, plane: mujoco.MjvGeom) -> np.ndarray:
-        """A depth buffer with nothing but a plane in it, seen from its front."""
+    def plane_buffer(self, plane: mujoco.MjvGeom) -> np.ndarray:
+        """A depth buffer with nothing but a plane in it, if that is seen from its front."""
         offset = (self.eye - plane.pos) @ plane.mat
         # How fast a ray goes along the plane's axes: affine in the pixel.
         along = [self._x * x + (self._y * y + z) for x, y, z in (self._rotation.T @ plane.mat).T]
         inverse = -along[2] / max(offset[2], 1e-9)
         buffer = (1 / self._near - inverse) / (1 / self._near - 1 / self._far)
-        met = (inverse > 0) & (buffer > 0) & (buffer < 1) & (offset[2] > 0)
+        hit = (inverse > 0) & (buffer > 0) & (buffer < 1) & (offset[2] > 0)
         for axis in (0, 1):
             if plane.size[axis] > 0:
-                met &= np.abs(along[axis] + offset[axis] * inverse) <= plane.size[axis] * inverse
-        return np.where(met, buffer, 1).astype(np.float32)
+                hit &= np.abs(along[axis] + offset[axis] * inverse) <= plane.size[axis] * inverse
+        return np.where(hit, buffer, 1).astype(np.float32)
 
     def load(self, vertices: np.ndarray, triangles: np.ndarray) -> None:
         """What to draw from now on: vertices (n, 3) and triangles (m, 3), counter-clockwise seen from outside."""
-        seen = (vertices - self.eye) @ self._axes
-        self._triangles, self._ends, self._share = _clip(-seen[:, 2], triangles, self._near)
-        self._seen = self._with_cuts(seen)
+        local = (vertices - self.eye) @ self._axes
+        self._triangles, self._ends, self._share = _clip(-local[:, 2], triangles, self._near)
+        self._local = self._with_cuts(local)
 
-    def draw(self, colours: np.ndarray, picture: np.ndarray, buffer: np.ndarray, flat: bool = False) -> None:
-        """Draw into a picture (h, w, 3) float32 and a depth buffer, both changed, in colours of the vertices (n, 3);
-        `flat` if all vertices of a triangle have the same."""
+    def draw(self, colors: np.ndarray, image: np.ndarray, buffer: np.ndarray, flat: bool = False) -> None:
+        """Draw what is loaded.
+
+        Args:
+            colors: Of the vertices, (n, 3).
+            image: (h, w, 3) float32, changed.
+            buffer: A depth buffer, changed.
+            flat: Whether all vertices of a triangle have the same color.
+        """
         if not len(self._triangles):
             return
         settings = cv2.TriangleRasterizeSettings()
@@ -66,18 +77,18 @@ class Raster:
         settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)
         settings.setGlCompatibleMode(cv2.RASTERIZE_COMPAT_INVDEPTH)
         cv2.triangleRasterize(
-            self._seen, self._triangles, self._with_cuts(colours), picture, buffer,
+            self._local, self._triangles, self._with_cuts(colors), image, buffer,
             np.eye(4), self._field, self._near, self._far, settings,
         )  # fmt: skip
 
-    def outline(self, triangles: np.ndarray) -> int:
-        """How many pixels some of the triangles (k, 3) would cover, were nothing before them and no edge to the
-        picture. They must be of vertices in front of the near plane."""
-        corners = self._seen[triangles]
+    def outline_area(self, triangles: np.ndarray) -> int:
+        """How many pixels some of the triangles (k, 3) would cover, were nothing before them and no edge to the image.
+        They must be of vertices in front of the near plane."""
+        corners = self._local[triangles]
         plane = corners[..., :2] / -corners[..., 2:]
         pixel = 2 * np.tan(self._field / 2) / self.shape[0]
         low, high = (np.asarray(f / pixel) for f in (plane.min((0, 1)), plane.max((0, 1))))
-        # A window of its own: whole pixels away from the picture, so that it is cut into the same pixels.
+        # A window of its own: whole pixels away from the image, so that it is cut into the same pixels.
         first = np.floor(low + np.array(self.shape[::-1]) / 2) - np.array(self.shape[::-1]) / 2
         size = int(np.ceil((high - first).max())) + 1
         middle = (first + size / 2) * pixel
@@ -102,7 +113,7 @@ class Raster:
 
 
 def _clip(depth: np.ndarray, triangles: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut off what lies nearer than `near`, which the rasteriser cannot draw.
+    """Cut off what lies nearer than `near`, which the rasterizer cannot draw.
 
     Returns triangles (m, 3), and of the vertices to append: between which two they lie (2, k), and where (k, 1).
     """
@@ -113,12 +124,12 @@ def _clip(depth: np.ndarray, triangles: np.ndarray, near: float) -> tuple[np.nda
     new = len(depth)
     for inside in (1, 2):
         # Turn the triangle until the vertex that is alone on its side comes first.
-        some, alone = triangles[count == inside], front[count == inside] == (inside == 1)
-        if len(some):
+        cut, alone = triangles[count == inside], front[count == inside] == (inside == 1)
+        if len(cut):
             turn = (alone.argmax(1)[:, None] + np.arange(3)) % 3
-            a, b, c = np.take_along_axis(some, turn, 1).T
-            ab, ac = new + np.arange(2 * len(some)).reshape(2, -1)
-            new += 2 * len(some)
+            a, b, c = np.take_along_axis(cut, turn, 1).T
+            ab, ac = new + np.arange(2 * len(cut)).reshape(2, -1)
+            new += 2 * len(cut)
             ends += [np.stack([a, b]), np.stack([a, c])]
             pieces = [[a, ab, ac]] if inside == 1 else [[ab, b, c], [ab, c, ac]]
             kept += [np.stack(piece, -1) for piece in pieces]

@@ -1,7 +1,7 @@
 """Light, shadow and texture as MuJoCo's OpenGL renderer has them, for points held in NumPy arrays.
 
-What a light gives is OpenGL's fixed-function lighting (specification of OpenGL 2.1, section 2.14) with a local viewer;
-vectors are in the world frame, colours RGB in [0, 1], everything float32.
+Lighting is OpenGL's fixed-function one (specification of OpenGL 2.1, section 2.14) with a local viewer; vectors are in
+the world frame, colors RGB in [0, 1], everything float32.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ SPOT, DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_SPOT), int(mujoco.mjtLightTy
 
 SHININESS = 128.0
 """OpenGL's exponent of a material whose shininess is 1."""
-AHEAD = 0.0015
+SHADOW_BIAS = 0.0015
 """A surface is in shadow where something is nearer to the light by more than so many metres."""
-CLOSE = 0.01
-"""Nothing nearer to a lamp, in metres, throws a shadow, nor anything behind it."""
-DISTANT = 30.0
-"""Metres from which a directional light throws its shadows."""
+SHADOW_NEAR = 0.01
+"""Nothing nearer to a lamp, in metres, casts a shadow, nor anything behind it."""
+SUN_DISTANCE = 30.0
+"""Metres from which a directional light casts its shadows."""
 
 
 class Surface(NamedTuple):
@@ -36,11 +36,11 @@ class Surface(NamedTuple):
     gloss: np.ndarray
     """Specular reflection and shininess (n, 2)."""
     glow: np.ndarray
-    """What it shows without any light, (n, 3)."""
+    """The color that it has without any light, (n, 3)."""
 
 
 class Light(NamedTuple):
-    """A light of MuJoCo's abstract scene."""
+    """A light of an `mjvScene`, by the names that MuJoCo gives its properties."""
 
     position: np.ndarray
     direction: np.ndarray
@@ -74,8 +74,17 @@ def lights(scene: mujoco.MjvScene) -> list[Light]:
     ]
 
 
-def lit(surface: Surface, light: Light, eye: np.ndarray) -> np.ndarray:
-    """What of a light comes from a surface to an eye at `eye` (3,), RGB (n, 3) in [0, 1]."""
+def illuminate(surface: Surface, light: Light, eye: np.ndarray) -> np.ndarray:
+    """The light that a surface reflects to an eye.
+
+    Args:
+        surface: n points of it.
+        light: Where it comes from.
+        eye: (3,), metres.
+
+    Returns:
+        RGB (n, 3) float32 in [0, 1].
+    """
     if light.directional:
         towards: np.ndarray = -light.direction[None]
         strength: np.ndarray = np.ones((1, 1), np.float32)
@@ -90,19 +99,24 @@ def lit(surface: Surface, light: Light, eye: np.ndarray) -> np.ndarray:
             inside = cosine >= np.cos(np.deg2rad(light.cutoff))
             strength = strength * np.where(inside, np.maximum(cosine, 0) ** light.exponent, 0)
     incidence = np.maximum(np.einsum("ij,ij->i", surface.normals, np.broadcast_to(towards, surface.normals.shape)), 0)
-    colour = surface.rgb * (light.ambient + incidence[:, None] * light.diffuse)
+    color = surface.rgb * (light.ambient + incidence[:, None] * light.diffuse)
     if light.specular.any():
         half = eye - surface.points
         half /= np.maximum(np.sqrt(np.einsum("ij,ij->i", half, half))[:, None], 1e-6)
         half += towards
         cosine = np.einsum("ij,ij->i", surface.normals, half) / np.sqrt(np.einsum("ij,ij->i", half, half) + 1e-12)
         shine = np.where(incidence > 0, np.maximum(cosine, 0) ** (SHININESS * surface.gloss[:, 1]), 0)
-        colour += (surface.gloss[:, 0] * shine)[:, None] * light.specular
-    return np.clip(colour * strength, 0, 1).astype(np.float32)
+        color += (surface.gloss[:, 0] * shine)[:, None] * light.specular
+    return np.clip(color * strength, 0, 1).astype(np.float32)
 
 
 class Texture:
-    """A texture of the model, each level half as wide as the one before."""
+    """A texture of the model as a mipmap: each level is half as wide as the one before.
+
+    Args:
+        model: The model.
+        texture: The texture's id.
+    """
 
     def __init__(self, model: mujoco.MjModel, texture: int) -> None:
         width, height = model.tex_width[texture], model.tex_height[texture]
@@ -113,16 +127,16 @@ class Texture:
             data = np.tile(data, (6, 1, 1))
         self.levels = [data.astype(np.float32) / 255]
 
-    def flat(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Colours (h, w, 3) in [0, 1] of a two-dimensional texture, repeated for ever, at coordinates (h, w)."""
+    def sample_2d(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Colors (h, w, 3) in [0, 1] of a two-dimensional texture, repeated for ever, at coordinates (h, w)."""
         height, width = self.levels[0].shape[:2]
         image = self._level(_spacing(u * width, v * height))
         height, width = image.shape[:2]
         u, v = (u - np.floor(u.min())) * width - 0.5, (v - np.floor(v.min())) * height - 0.5
         return cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
-    def around(self, direction: np.ndarray) -> np.ndarray:
-        """Colours (h, w, 3) in [0, 1] of a cube texture in directions (h, w, 3), as OpenGL numbers the cube's sides."""
+    def sample_cube(self, direction: np.ndarray) -> np.ndarray:
+        """Colors (h, w, 3) in [0, 1] of a cube texture in directions (h, w, 3), as OpenGL numbers the cube's sides."""
         size = np.abs(direction)
         axis = size.argmax(-1)
         major = np.take_along_axis(direction, axis[..., None], -1)[..., 0]
@@ -157,28 +171,33 @@ def _spacing(u: np.ndarray, v: np.ndarray) -> float:
 
 
 class ShadowMap:
-    """What a light sees of whatever throws shadows, from behind: the sides that it does not light."""
+    """What a light sees of whatever casts shadows, from behind: the sides that it does not light.
+
+    Args:
+        light: The light.
+        vertices: Of all that casts shadows, (n, 3), metres.
+        triangles: Indices of vertices (m, 3), counter-clockwise seen from outside.
+        size: Width and height of the map, pixels.
+    """
 
     def __init__(self, light: Light, vertices: np.ndarray, triangles: np.ndarray, size: int) -> None:
-        """`vertices` (n, 3) and `triangles` (m, 3), counter-clockwise, of all that throws shadows, and how many pixels
-        wide the map is to be."""
         z = light.direction.astype(float)
         x = np.cross(z, [0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0])
         x /= np.linalg.norm(x)
         self._axes = np.stack([x, np.cross(z, x), z])
-        # A directional light is a very distant one: the rasteriser knows perspective alone.
-        self._eye = vertices.mean(0) - DISTANT * z if light.directional else light.position.astype(float)
+        # A directional light is a very distant one: the rasterizer knows perspective alone.
+        self._eye = vertices.mean(0) - SUN_DISTANCE * z if light.directional else light.position.astype(float)
         seen = (vertices - self._eye) @ self._axes.T
-        triangles = np.ascontiguousarray(triangles[(seen[:, 2] > CLOSE)[triangles].all(1)])
+        triangles = np.ascontiguousarray(triangles[(seen[:, 2] > SHADOW_NEAR)[triangles].all(1)])
         used = np.zeros(len(vertices), bool)
         used[triangles] = True
         corners = seen[used] if used.any() else np.array([[0.0, 0.0, 1.0]])
         plane = corners[:, :2] / corners[:, 2:]
-        self._centre = (plane.max(0) + plane.min(0)) / 2
+        self._center = (plane.max(0) + plane.min(0)) / 2
         self._half = max(float(np.ptp(plane, axis=0).max()) / 2, 1e-6) * 1.02
         near, far = float(corners[:, 2].min()) * 0.99, float(corners[:, 2].max()) * 1.01
         self._inverse = np.array([1 / near, 1 / near - 1 / far])
-        seen[:, :2] -= self._centre * seen[:, 2:]
+        seen[:, :2] -= self._center * seen[:, 2:]
         self._size = size
         self._map = np.ones((self._size, self._size), np.float32)
         settings = cv2.TriangleRasterizeSettings()
@@ -191,12 +210,12 @@ class ShadowMap:
     def reaches(self, points: np.ndarray) -> np.ndarray:
         """Whether the light reaches points (h, w, 3): (h, w) bool."""
         transform = np.c_[self._axes, -self._axes @ self._eye]
-        transform[:2] -= self._centre[:, None] * transform[2]
+        transform[:2] -= self._center[:, None] * transform[2]
         transform[:2] *= self._size / 2 / self._half
         x, y, depth = cv2.split(cv2.transform(points, transform))
         middle = (self._size - 1) / 2
         u, v = (np.asarray(a / depth + middle, np.float32) for a in (x, y))
-        # What a depth buffer would hold for something nearer to the light by `AHEAD`; 1 is what it holds for nothing.
-        threshold = np.minimum((self._inverse[0] - 1 / np.maximum(depth - AHEAD, 1e-6)) / self._inverse[1], 1)
+        # What a depth buffer would hold for something nearer to the light by `SHADOW_BIAS`; it holds 1 for nothing.
+        threshold = np.minimum((self._inverse[0] - 1 / np.maximum(depth - SHADOW_BIAS, 1e-6)) / self._inverse[1], 1)
         outside = cv2.BORDER_CONSTANT
         return cv2.remap(self._map, u, v, cv2.INTER_NEAREST, borderMode=outside, borderValue=1.0) >= threshold

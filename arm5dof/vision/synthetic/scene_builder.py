@@ -1,4 +1,4 @@
-"""What a scene is made of besides the arm: a table in a room, what lies on it, lamps, and where the camera stands."""
+"""What a scene is made of besides the arm: a table in a room, what lies on it, lamps, and where the cameras stand."""
 
 from __future__ import annotations
 
@@ -6,39 +6,45 @@ import mujoco
 import numpy as np
 
 from arm5dof.vision.objects import ALONG_X, BOX, CYLINDER, Part
-from arm5dof.vision.synthetic import textures as patterns
+from arm5dof.vision.synthetic import textures
 
 CAMERA, SECOND = "camera", "second camera"
-TEXTURE = 128
-"""Width of a texture, pixels."""
+TEXTURE_SIZE = 128
+"""Width and height of a texture, pixels."""
 
 
-class Builder:
-    """Adds to a spec, at random. What is on a texture is filled in after compiling, which is quicker."""
+class SceneBuilder:
+    """Adds to a spec, at random. What is on a texture is filled in after compiling, which is quicker.
 
-    def __init__(self, spec: mujoco.MjSpec, rng: np.random.Generator, family: patterns.Family) -> None:
+    Args:
+        spec: What it adds to.
+        rng: The generator that everything comes from.
+        family: The textures to choose from.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, rng: np.random.Generator, family: textures.Family) -> None:
         self.rng = rng
         self._spec, self._family = spec, family
-        self._pictures: dict[str, np.ndarray] = {}
+        self._images: dict[str, np.ndarray] = {}
         self._count = 0
 
     def compile(self) -> mujoco.MjModel:
         """The model, with everything that was added."""
         model = self._spec.compile()
-        for name, picture in self._pictures.items():
+        for name, image in self._images.items():
             first = model.tex_adr[model.texture(name).id]
-            model.tex_data[first : first + picture.size] = picture.ravel()
+            model.tex_data[first : first + image.size] = image.ravel()
         return model
 
     def paint_arm(self) -> None:
-        """Sometimes the arm has other colours."""
+        """Sometimes give the arm other colors."""
         for material in self._spec.materials:
             if self.rng.random() < 0.3:
-                material.rgba = [*patterns.colour(self.rng), 1]
+                material.rgba = [*textures.random_color(self.rng), 1]
             material.specular, material.shininess = self.rng.uniform(0, 0.6), self.rng.uniform(0.1, 0.9)
 
     def room(self) -> None:
-        """A table and the floor that it stands on."""
+        """Add a table and the floor that it stands on."""
         u = self.rng.uniform
         half = (u(0.35, 0.8), u(0.35, 0.8), 0.015)
         table = self._material(self._surface(), repeat=u(1, 8))
@@ -48,7 +54,7 @@ class Builder:
         self._spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, -below], material=floor)
 
     def paper(self) -> None:
-        """Up to four pieces of paper lying flat, printed or of one colour."""
+        """Add up to four pieces of paper lying flat, printed or of one color."""
         u = self.rng.uniform
         for layer in range(self.rng.integers(0, 5)):
             thickness = 0.0002 * (layer + 1)
@@ -57,25 +63,29 @@ class Builder:
             if printed:
                 material = self._material(self._family.papers[self.rng.integers(len(self._family.papers))])
             else:
-                material = self._material(None, patterns.colour(self.rng))
+                material = self._material(None, textures.random_color(self.rng))
             part = Part(CYLINDER, (half[0], thickness)) if round_ and not printed else Part(BOX, (*half, thickness))
             self.body(np.array([*u([-0.2, -0.35], [0.35, 0.35]), 0.0]), u(-np.pi, np.pi), (part,), material)
 
     def paint(self, hue: float | None) -> str:
-        """A material of a hue in degrees, or of any colour: mostly plain, sometimes with a faint pattern."""
-        colour = patterns.colour(self.rng, hue, vivid=0.0 if hue is None else 0.6)
+        """Add a material of a hue in degrees, or of any color: mostly plain, sometimes with a faint texture.
+
+        Returns:
+            Its name.
+        """
+        color = textures.random_color(self.rng, hue, vivid=0.0 if hue is None else 0.6)
         if self.rng.random() < 0.75:
-            return self._material(None, colour)
-        return self._material(lambda rng, size: 255 - (255 - self._surface()(rng, size)) // 4, colour, cube=True)
+            return self._material(None, color)
+        return self._material(lambda rng, size: 255 - (255 - self._surface()(rng, size)) // 4, color, cube=True)
 
     def body(self, position: np.ndarray, yaw: float, parts: tuple[Part, ...], material: str, name: str = "") -> None:
-        """Parts of one material, somewhere on the table."""
+        """Add parts of one material, at a position (3,), metres, and a yaw, radians, in the base frame."""
         body = self._spec.worldbody.add_body(name=name, pos=position, quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
         for part in parts:
             self._add(body, part, material)
 
     def lamps(self, distant: bool) -> None:
-        """One to three lamps of nearly white light above the table, or the tinted light of one or two distant
+        """Add one to three lamps of nearly white light above the table, or the tinted light of one or two distant
         windows."""
         u = self.rng.uniform
         head = self._spec.visual.headlight
@@ -94,7 +104,7 @@ class Builder:
             light.cutoff, light.exponent = u(40, 70), u(0, 10)
 
     def camera(self, name: str) -> None:
-        """0.6 to 0.9 m away, from overhead to 35 degrees above the table, on the side that the arm works on."""
+        """Add a camera 0.6 to 0.9 m away, from overhead to 35 degrees above the table, where the arm works."""
         u = self.rng.uniform
         azimuth, elevation = u(-1.9, 1.9), np.arcsin(u(np.sin(np.deg2rad(35)), 1))
         back, right = _direction(azimuth, elevation), np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -110,31 +120,34 @@ class Builder:
         body.add_geom(type=part.kind, size=size, material=material, contype=0, conaffinity=0, **place)
 
     def _material(
-        self, pattern: patterns.Pattern | None, colour: np.ndarray | None = None, repeat: float = 1, cube: bool = False
+        self, texture: textures.Texture | None, color: np.ndarray | None = None, repeat: float = 1, cube: bool = False
     ) -> str:
-        """The name of a new material with a pattern, a colour, or both."""
+        """The name of a new material with a texture, a color, or both."""
         self._count += 1
         name = f"material {self._count}"
         material = self._spec.add_material(name=name)
-        material.rgba = [*(np.ones(3) if colour is None else colour), 1]
+        material.rgba = [*(np.ones(3) if color is None else color), 1]
         material.specular, material.shininess = self.rng.uniform(0, 0.5), self.rng.uniform(0.1, 0.9)
-        if pattern is not None:
-            self._pictures[name] = np.tile(pattern(self.rng, TEXTURE), (6 if cube else 1, 1, 1))
+        if texture is not None:
+            self._images[name] = np.tile(texture(self.rng, TEXTURE_SIZE), (6 if cube else 1, 1, 1))
             kind = mujoco.mjtTexture.mjTEXTURE_CUBE if cube else mujoco.mjtTexture.mjTEXTURE_2D
-            texture = self._spec.add_texture(name=name, type=kind, width=TEXTURE, height=TEXTURE, nchannel=3)
-            texture.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+            added = self._spec.add_texture(name=name, type=kind, width=TEXTURE_SIZE, height=TEXTURE_SIZE, nchannel=3)
+            added.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
             roles = [""] * int(mujoco.mjtTextureRole.mjNTEXROLE)
             roles[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = name
             material.textures, material.texrepeat = roles, [repeat, repeat]
         return name
 
-    def _surface(self) -> patterns.Pattern:
+    def _surface(self) -> textures.Texture:
         return self._family.surfaces[self.rng.integers(len(self._family.surfaces))]
 
 
-def other_shape(rng: np.random.Generator) -> tuple[tuple[Part, ...], float, float, float | None]:
-    """Parts, half height, radius and hue (None for any) of something that is not in the catalogue and that no thing
-    in it looks like from further away."""
+def distractor(rng: np.random.Generator) -> tuple[tuple[Part, ...], float, float, float | None]:
+    """Something that is not in the catalogue and that no object in it looks like from further away.
+
+    Returns:
+        Its parts, half height and radius in metres, and hue in degrees, None for any.
+    """
     u = rng.uniform
     match rng.integers(8):
         case 0:  # A cube, neither red nor blue.

@@ -1,6 +1,6 @@
-"""Random pictures for tables, floors, things and paper: two families that have no pattern in common.
+"""Random textures for tables, floors, objects and paper: two families that have none in common.
 
-Each takes a generator and a size and gives a picture, RGB uint8 (size, size, 3).
+Each takes a generator and a size and returns an image, RGB uint8 (size, size, 3).
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-Pattern = Callable[[np.random.Generator, int], np.ndarray]
+Texture = Callable[[np.random.Generator, int], np.ndarray]
 
 
-def colour(rng: np.random.Generator, hue: float | None = None, vivid: float = 0.0) -> np.ndarray:
-    """A colour, RGB (3,) in [0, 1]: any, or of a `hue` in degrees, and no duller than `vivid` in [0, 1]."""
+def random_color(rng: np.random.Generator, hue: float | None = None, vivid: float = 0.0) -> np.ndarray:
+    """A color, RGB (3,) in [0, 1]: any, or of a `hue` in degrees, and no duller than `vivid` in [0, 1]."""
     if hue is None:
         hue, grey = rng.uniform(0, 360), rng.random() < 0.2 and not vivid
     else:
@@ -26,15 +26,18 @@ def colour(rng: np.random.Generator, hue: float | None = None, vivid: float = 0.
 
 
 def checker(rng: np.random.Generator, size: int) -> np.ndarray:
+    """A checkerboard."""
     i, j = np.mgrid[:size, :size] * int(rng.choice([2, 4, 8, 16])) // size
     return _between(rng, (i + j) % 2, contrast=rng.uniform(0.05, 1))
 
 
 def clouds(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Smooth noise."""
     return _between(rng, _noise(rng, size), contrast=rng.uniform(0.1, 1))
 
 
 def planks(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Boards with grain and seams."""
     boards = int(rng.choice([2, 4, 8]))
     tone = np.repeat(rng.random(boards), size // boards)[:, None]
     grain = cv2.resize(rng.random((size // 2, 4)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
@@ -43,10 +46,12 @@ def planks(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def plain(rng: np.random.Generator, size: int) -> np.ndarray:
+    """One color."""
     return _between(rng, np.zeros((size, size)), contrast=0.0)
 
 
 def stripes(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Stripes, straight or wavy, sharp or soft."""
     i, j = np.mgrid[:size, :size] / size
     along = rng.integers(-8, 9) * i + rng.integers(1, 9) * j + rng.uniform(0, 0.5) * _noise(rng, size)
     share = 0.5 + 0.5 * np.sin(2 * np.pi * along)
@@ -54,13 +59,14 @@ def stripes(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def dots(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Dots in rows, every other row shifted."""
     n, radius = int(rng.choice([3, 4, 6, 10, 16])), rng.uniform(0.15, 0.48)
     i, j = np.mgrid[:size, :size] * n / size
     return _between(rng, np.hypot((i + 0.5 * (np.floor(j) % 2)) % 1 - 0.5, j % 1 - 0.5) < radius, rng.uniform(0.1, 1))
 
 
 def splinters(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Cells round random points, each of its own tone."""
+    """Cells around random points, each of its own tone."""
     points = rng.random((int(rng.integers(6, 60)), 2)) * size
     i, j = np.mgrid[: size // 2, : size // 2] * 2 + 1
     apart = np.abs(np.stack([i, j], -1)[:, :, None] - points)
@@ -80,6 +86,7 @@ def strokes(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Tiles with joints, each of its own tone."""
     n, joint = int(rng.choice([2, 3, 5, 8])), int(rng.integers(1, 5))
     i, j = np.mgrid[:size, :size]
     grout = (i * n % size < joint * n) | (j * n % size < joint * n)
@@ -88,6 +95,7 @@ def tiles(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def marble(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Veins."""
     i, j = np.mgrid[:size, :size] / size
     waves = rng.integers(1, 5, 2)
     veins = np.abs(np.sin(np.pi * (waves[0] * i + waves[1] * j + rng.uniform(0.5, 2) * _noise(rng, size))))
@@ -95,11 +103,13 @@ def marble(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def granite(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Grains."""
     grains = cv2.resize(rng.random((size // 2, size // 2)).astype(np.float32), (size, size))
     return _between(rng, grains > rng.uniform(0.5, 0.9), contrast=rng.uniform(0.1, 0.6))
 
 
 def weave(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Woven threads."""
     i, j = np.mgrid[:size, :size] * 2 * np.pi * int(rng.choice([4, 8, 16, 32])) / size
     return _between(rng, 0.5 + 0.25 * (np.sin(i) + np.sin(j)) * np.sign(np.sin(i / 2) * np.sin(j / 2) + 1e-9))
 
@@ -115,17 +125,17 @@ def text(rng: np.random.Generator, size: int) -> np.ndarray:
             page[top : top + line, left : min(right, size - line)] = rng.uniform(0, 0.5)
             left = right + line
     if rng.random() < 0.4:
-        centre = tuple(int(v) for v in rng.integers(size // 4, 3 * size // 4, 2))
-        cv2.circle(page, centre, int(rng.integers(size // 10, size // 4)), rng.uniform(0, 0.6), -1)
-    ink, paper = colour(rng) * 0.4, np.full(3, rng.uniform(0.8, 1))
+        center = tuple(int(v) for v in rng.integers(size // 4, 3 * size // 4, 2))
+        cv2.circle(page, center, int(rng.integers(size // 10, size // 4)), rng.uniform(0, 0.6), -1)
+    ink, paper = random_color(rng) * 0.4, np.full(3, rng.uniform(0.8, 1))
     return _mix(page, ink, paper)
 
 
 def shapes(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Printed paper: shapes of many colours, full or in outline, on white."""
+    """Printed paper: shapes of many colors, full or in outline, on white."""
     page = np.full((size, size, 3), 255 * rng.uniform(0.8, 1))
     for _ in range(rng.integers(1, 12)):
-        ink, middle = (255 * colour(rng)).tolist(), rng.uniform(0, size, 2)
+        ink, middle = (255 * random_color(rng)).tolist(), rng.uniform(0, size, 2)
         width = -1 if rng.random() < 0.5 else int(rng.integers(1, 8))
         half, turned = rng.uniform(0.02, 0.25, 2) * size, rng.uniform(0, 360)
         if rng.random() < 0.4:
@@ -142,10 +152,10 @@ def shapes(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def target(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Printed paper: rings round a middle."""
+    """Printed paper: rings around a center."""
     i, j = np.mgrid[:size, :size] / size - rng.uniform(0.3, 0.7, (2, 1, 1))
     rings = np.sin(np.hypot(i, j) * rng.uniform(20, 90)) > rng.uniform(-0.7, 0.7)
-    return _mix(rings, colour(rng) * 0.4, np.full(3, rng.uniform(0.8, 1)))
+    return _mix(rings, random_color(rng) * 0.4, np.full(3, rng.uniform(0.8, 1)))
 
 
 def bars(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -154,14 +164,14 @@ def bars(rng: np.random.Generator, size: int) -> np.ndarray:
     code = cv2.resize(cells.astype(np.float32), (size, size), interpolation=cv2.INTER_NEAREST)
     margin = size // 10
     code[:margin] = code[-margin:] = code[:, :margin] = code[:, -margin:] = 1
-    return _mix(code, colour(rng) * 0.3, np.full(3, rng.uniform(0.8, 1)))
+    return _mix(code, random_color(rng) * 0.3, np.full(3, rng.uniform(0.8, 1)))
 
 
 class Family(NamedTuple):
     """What surfaces look like, and what is printed on paper."""
 
-    surfaces: tuple[Pattern, ...]
-    papers: tuple[Pattern, ...]
+    surfaces: tuple[Texture, ...]
+    papers: tuple[Texture, ...]
 
 
 TRAINING = Family((checker, clouds, planks, plain, stripes, dots, splinters, strokes), (text, checker, shapes, dots))
@@ -180,12 +190,12 @@ def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def _between(rng: np.random.Generator, share: np.ndarray, contrast: float = 1.0) -> np.ndarray:
-    """A random colour where `share` (size, size) is 0, and where it is 1 one that differs by `contrast`; both are
-    duller than things may be."""
-    first, second = (0.7 * colour(rng) + 0.3 * rng.uniform(0.2, 0.9) for _ in range(2))
+    """A random color where `share` (size, size) is 0, and where it is 1 one that differs by `contrast`; both are
+    duller than objects may be."""
+    first, second = (0.7 * random_color(rng) + 0.3 * rng.uniform(0.2, 0.9) for _ in range(2))
     return _mix(share, first, first + contrast * (second - first))
 
 
 def _mix(share: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    picture = first + np.asarray(share, float)[..., None] * (second - first)
-    return np.clip(np.round(picture * 255), 0, 255).astype(np.uint8)
+    image = first + np.asarray(share, float)[..., None] * (second - first)
+    return np.clip(np.round(image * 255), 0, 255).astype(np.uint8)

@@ -14,21 +14,19 @@ import cv2
 import numpy as np
 import pytest
 from helpers.onnx_bytes import NAMES, SIZE, constant, output
-from helpers.pickles import Shell, save
-from helpers.yolov5_bytes import Architecture
+from helpers.videos import RATE, greys, read_video, write_video
 
 from arm5dof.cli import main as cli
 from arm5dof.cli.vision.detecting import interruptible
-from arm5dof.errors import UserError
 from arm5dof.runtime import progress
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.detectors.loading import detect, load, read_names
+from arm5dof.vision.detectors.loading import detect, load_detector
+from arm5dof.vision.frames import Frame
 from arm5dof.vision.images import read
 from arm5dof.vision.io.sinks import folder
-from arm5dof.vision.io.sources import Frame, Source, open_source
+from arm5dof.vision.io.sources import Source, open_source
 from arm5dof.vision.objects import CLASS_NAMES
 
-RATE = 12.5
 BALL = {"class_name": "ball", "class_id": 1, "confidence": 0.9, "xyxy": [12, 16, 28, 40]}
 """What the network of `model` finds in every image of 64 x 64."""
 
@@ -41,27 +39,6 @@ def command(*arguments):
 def model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "ball.onnx"
     return constant(path, output("yolov8"), (1, 3, SIZE, SIZE), {"names": str(list(NAMES))})
-
-
-def write_video(path, pictures, code="mp4v"):
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), RATE, pictures[0].shape[1::-1])
-    for picture in pictures:
-        writer.write(picture[..., ::-1])
-    writer.release()
-    return path
-
-
-def read_video(path):
-    """Frames, RGB, and their number in a second."""
-    capture, frames = cv2.VideoCapture(str(path)), []
-    while (read := capture.read())[0]:
-        frames.append(read[1][..., ::-1])
-    return frames, capture.get(cv2.CAP_PROP_FPS)
-
-
-def greys(n):
-    """Frames that get lighter."""
-    return [np.full((SIZE, SIZE, 3), 20 + 200 * i // n, np.uint8) for i in range(n)]
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +101,7 @@ def test_one_format_whatever_the_network(test_data, tmp_path, capsys):
     """JSON is printed as it is written; the weights in JAX and as ONNX find the same, of the classes asked for."""
     vision = test_data / "vision"
     names = tmp_path / "names.txt"
-    names.write_text("\n".join(load(vision / "models" / "yolov5n.pt").class_names))
+    names.write_text("\n".join(load_detector(vision / "models" / "yolov5n.pt").class_names))
     both = []
     for more in (["yolov5n.pt"], ["yolov5n_fp16.onnx", "--names", names]):
         words = ["--detector", vision / "models" / more[0], *more[1:], "--json", "--classes", "bus,train"]
@@ -222,7 +199,7 @@ def test_a_camera(instead_of_the_camera, model, tmp_path, capsys):
     source = open_source(["0"])
     assert source.live and source.length is None and source.rate == RATE
     with folder(tmp_path / "found", source) as write:
-        for frame, found in detect(source.frames, load(model)):
+        for frame, found in detect(source.frames, load_detector(model)):
             write(frame, found)
             if frame.time > 1:
                 break
@@ -244,28 +221,6 @@ def test_frames_are_rgb_and_let_go_of_their_file(tmp_path):
     assert frame.image.dtype == np.uint8 and frame.image[..., 0].min() > 200 and frame.image[..., 1:].max() < 50
     frames.close()
     assert list(frames) == []
-
-
-def test_classes_and_names(photos, tmp_path):
-    path = constant(tmp_path / "x.onnx", output("yolov8"), (1, 3, SIZE, SIZE))
-    (tmp_path / "names.txt").write_text("\ufeffcup\r\nred ball\r\n\r\n", encoding="utf-8")
-    detector = load(path, read_names(tmp_path / "names.txt"))
-    assert detector.class_names == ("cup", "red ball")
-    frames = [Frame("x", np.zeros((SIZE, SIZE, 3), np.uint8))]
-    assert [len(found) for _, found in detect(frames, detector)] == [1]
-    assert [len(found) for _, found in detect(frames, detector, ["cup"])] == [0]
-    assert [len(found) for _, found in detect(frames, detector, ["cup", "red ball"])] == [1]
-    with pytest.raises(UserError, match="knows no class 'bowl'; it knows: cup, red ball"):
-        detect(frames, detector, ["bowl"])
-
-
-def test_a_detector_is_told_by_its_content_where_its_name_says_nothing(model, tmp_path):
-    (tmp_path / "network").write_bytes(model.read_bytes())
-    Architecture(4, 1, 2).save(tmp_path / "weights.bin")
-    assert load(tmp_path / "network").class_names == NAMES
-    assert load(tmp_path / "weights.bin", ["a", "b"], size=SIZE).class_names == ("a", "b")
-    with pytest.raises(UserError, match="tells 2 classes apart, and 3 names were given"):
-        load(tmp_path / "weights.bin", ["a", "b", "c"])
 
 
 # What is wrong
@@ -328,12 +283,6 @@ def test_bad_input_is_one_line(photos, clip, model, tmp_path, capfd):
     assert command("simulated:0") == 2 and "ask for one or more" in capfd.readouterr().err
 
 
-def test_yolov8_weights_are_refused_with_a_remedy(tmp_path):
-    save(tmp_path / "yolov8n.pt", {"model": Shell("ultralytics.nn.tasks.DetectionModel")})
-    with pytest.raises(UserError, match="YOLOv8 or later, of which only ONNX is read: export it"):
-        load(tmp_path / "yolov8n.pt")
-
-
 def test_what_came_before_a_damaged_image_is_kept(photos, model, tmp_path, capfd):
     whole = (photos / "c.PNG").read_bytes()
     (photos / "c.PNG").write_bytes(whole[: len(whole) // 2])
@@ -374,7 +323,7 @@ def test_a_full_disk_leaves_nothing(model, tmp_path):
 CAMERA = """
 import sys
 import cv2
-from arm5dof import cli, progress
+from arm5dof.cli import main as cli
 
 opened, video = cv2.VideoCapture, sys.argv.pop(1)
 cv2.VideoCapture = lambda what, *more: opened(video) if what == 0 else opened(what, *more)

@@ -9,7 +9,7 @@ import pytest
 
 from arm5dof.cli.main import main
 from arm5dof.runtime import files
-from arm5dof.vision.rendering import opengl as gl
+from arm5dof.vision.rendering import opengl
 
 
 def test_says_what_works(capsys):
@@ -17,11 +17,12 @@ def test_says_what_works(capsys):
     report = json.loads(capsys.readouterr().out)
     rendering = {line["what"]: line for line in report["rendering"]}
     assert rendering["software"]["works"] and "ms" in rendering["software"]["detail"]
-    for library in gl.known():
+    for library in opengl.libraries():
         line = rendering[f"OpenGL by {library}"]
-        assert line["works"] == (gl.problem(library) is None)
+        assert line["works"] == (opengl.problem(library) is None)
         assert line["works"] or line["remedy"]
-    assert rendering["chosen"]["detail"] == (f"OpenGL by {gl.working()}" if gl.working() else "software")
+    working = opengl.working_library()
+    assert rendering["chosen"]["detail"] == (f"OpenGL by {working}" if working else "software")
     assert all(line["works"] for line in report["detectors"]) and len(report["detectors"]) >= 3
 
 
@@ -44,11 +45,11 @@ def test_takes_no_arguments(capsys):
 @pytest.mark.parametrize("value", ["off", "disable"])
 def test_mujoco_gl_can_forbid_opengl(value, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", value)
-    assert gl.candidates() == ()
+    assert opengl.candidates() == ()
 
 
 def test_mujoco_gl_chooses(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", gl.known()[-1])
-    assert gl.candidates() == (gl.known()[-1],)
+    monkeypatch.setenv("MUJOCO_GL", opengl.libraries()[-1])
+    assert opengl.candidates() == (opengl.libraries()[-1],)
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    assert gl.candidates() == gl.known()
+    assert opengl.candidates() == opengl.libraries()

@@ -5,15 +5,15 @@ import json
 import cv2
 import numpy as np
 import pytest
-from cli.vision.test_detect import greys, read_video, write_video
 from helpers.onnx_bytes import NAMES, SIZE, constant, output
+from helpers.videos import greys, read_video, write_video
 
 from arm5dof.cli import main as cli
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.images import read
 from arm5dof.vision.rendering.simulated import simulated_camera
 from arm5dof.vision.synthetic import scene_builder as scenery
-from arm5dof.vision.synthetic.samples import shoot
+from arm5dof.vision.synthetic.samples import render_sample
 from arm5dof.vision.synthetic.scenes import random_scene
 
 SCENES = 3
@@ -33,14 +33,14 @@ def told(capsys, *words):
 @pytest.fixture(scope="module")
 def shots():
     """What `simulated` shows."""
-    return [shoot(number, 0, "evaluation", "auto") for number in range(SCENES)]
+    return [render_sample(number, 0, "evaluation", "auto") for number in range(SCENES)]
 
 
 @pytest.fixture(scope="module")
 def photo(shots, tmp_path_factory):
     """The picture of a scene, and beside it its camera, and how well that is known."""
     folder = tmp_path_factory.mktemp("photo")
-    cv2.imwrite(str(folder / "scene.png"), shots[1].picture[..., ::-1])
+    cv2.imwrite(str(folder / "scene.png"), shots[1].image[..., ::-1])
     shots[1].camera.replace(covariance=KNOWN).save(folder / "posed.yml")
     return folder / "scene.png"
 
@@ -83,8 +83,8 @@ def test_random_scenes(shots, tmp_path, capsys):
     assert len(off) >= 8 and np.median(off) < 2e-3 and np.mean(off < 5e-3) > 0.9
     for frame, shot in zip(frames, shots, strict=True):
         drawn = read(tmp_path / "placed" / frame["name"])
-        changed = (drawn != shot.picture).any(-1)
-        assert drawn.shape == shot.picture.shape and changed.mean() < 0.3
+        changed = (drawn != shot.image).any(-1)
+        assert drawn.shape == shot.image.shape and changed.mean() < 0.3
         for thing in frame["things"]:
             left, top, _, bottom = map(round, thing["xyxy"])
             assert changed[top:bottom, left].mean() > 0.9
@@ -112,7 +112,7 @@ def test_a_photograph_and_its_camera(shots, photo, tmp_path, capsys):
 
 
 def test_for_people(photo, capsys):
-    words = [photo, "--camera", photo.with_name("posed.yml"), "--classes", "dumbbell,ball", "--careful"]
+    words = [photo, "--camera", photo.with_name("posed.yml"), "--classes", "dumbbell,ball", "--tta"]
     assert command(*words, "--reach", 0.1, 0.2) == 0
     captured = capsys.readouterr()
     name, head, *rows, summary = captured.out.splitlines()
@@ -168,8 +168,8 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
         ([photo, tmp_path / "listed.txt", photo, *camera], "images and DETECTIONS.json do not go together"),
         ([tmp_path / "listed.txt"], "give one DETECTIONS.json and its --camera"),
         (
-            [tmp_path / "found.json", *camera, "--careful", "--iou", 0.5],
-            "leave out --iou, --careful: that takes images",
+            [tmp_path / "found.json", *camera, "--tta", "--iou", 0.5],
+            "leave out --iou, --tta: that takes images",
         ),
         ([tmp_path / "found.json", *camera, "--out", tmp_path / "new"], "leave out --out: that takes images"),
         ([photo, *camera, "--out", tmp_path / "folder"], "folder exists: choose another --out"),
@@ -185,7 +185,7 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
             "small.png has 64x64 pixels and the camera 640x480",
         ),
         ([photo, *camera, "--height", "ball=0"], "give metres above zero"),
-        ([clip, *small, "--careful"], "is not the tabletop detector, which alone can look more carefully"),
+        ([clip, *small, "--tta"], "is not the tabletop detector, which alone has test-time augmentation"),
     ]:
         assert command(*words) == 2, expected
         captured = capfd.readouterr()

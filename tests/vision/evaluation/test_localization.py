@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.evaluation.localization import LEVELS, Tally, look, pairs, place
+from arm5dof.vision.evaluation.localization import LEVELS, Tally, pairs, place, render_stereo_sample
 from arm5dof.vision.evaluation.simulated_calibration import rehearse
 from arm5dof.vision.localization.locate import Located
 from arm5dof.vision.objects import CLASS_NAMES
@@ -44,7 +44,7 @@ def test_the_levels_are_those_of_three_dimensions():
 
 @pytest.fixture(scope="module")
 def looks():
-    return [look(number, 4, "software") for number in range(6)]
+    return [render_stereo_sample(number, 4, "software") for number in range(6)]
 
 
 def test_what_is_found_is_placed(looks):
@@ -60,7 +60,7 @@ def test_what_is_found_is_placed(looks):
 
 
 def test_a_look_is_the_same_each_time(looks):
-    again = look(1, 4, "software")
+    again = render_stereo_sample(1, 4, "software")
     for one, other in zip(again.views, looks[1].views, strict=True):
         np.testing.assert_array_equal(one.picture, other.picture)
         np.testing.assert_array_equal(one.depth, other.depth)

@@ -98,7 +98,7 @@ def test_what_mujoco_renders_is_located():
         found = detections(tabletop.boxes(model, tabletop.cast(model, data, camera)[0], 4), names)
         located = by_plane(found, camera, SOLIDS)
         assert not any(located.reasons)
-        rays = np.asarray(camera.rays(found.centre))
+        rays = np.asarray(camera.rays(found.center))
         cast = camera.position + rays * ((middles[:, 2] - camera.position[2]) / rays[:, 2])[:, None]
         for i, name in enumerate(names):
             errors[name].append(1e3 * np.linalg.norm(located.position[i] - middles[i]))

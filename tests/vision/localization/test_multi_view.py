@@ -96,7 +96,7 @@ def test_what_mujoco_renders_is_located():
         np.testing.assert_array_equal(match(tuple(views), tuple(cameras), limit=20), rows)
         found = by_views(views, cameras, SOLIDS)
         assert not any(found.reasons)
-        points, _ = triangulate(tuple(cameras), np.stack([view.centre for view in views], 1))
+        points, _ = triangulate(tuple(cameras), np.stack([view.center for view in views], 1))
         cones += [name in ("cone", "pyramid") for name in names]
         errors += [*np.linalg.norm(found.position - middles, axis=1)]
         plain += [*np.linalg.norm(points - middles, axis=1)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.rendering import opengl as gl
+from arm5dof.vision.rendering import opengl
 from arm5dof.vision.rendering.simulated import simulated_camera
 
 WIDTH, HEIGHT = 160, 120
@@ -61,8 +61,8 @@ def room():
 
 @pytest.fixture(scope="module")
 def needs_gl():
-    if gl.working() is None:
-        pytest.skip(f"no OpenGL works here: { ({name: gl.problem(name) for name in gl.candidates()}) }")
+    if opengl.working_library() is None:
+        pytest.skip(f"no OpenGL works here: { ({name: opengl.problem(name) for name in opengl.candidates()}) }")
 
 
 def cast(model, data, camera):
@@ -107,7 +107,7 @@ def test_software_draws_what_opengl_draws(room, name, needs_gl):
 
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
-def test_small_things_are_seen_where_the_camera_model_projects_them(seed):
+def test_small_objects_are_seen_where_the_camera_model_projects_them(seed):
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
     points = rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.2], (5, 3))
@@ -222,10 +222,10 @@ def test_a_broken_opengl_is_noticed_in_another_process_and_software_draws(tmp_pa
     (tmp_path / "OpenGL" / "__init__.py").write_text("import os; os._exit(7)\n")
     program = (
         "import mujoco\n"
-        "from arm5dof.vision.rendering import opengl as gl\n"
+        "from arm5dof.vision.rendering import opengl\n"
         "from arm5dof.vision.rendering.simulated import simulated_camera\n"
         "model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><camera name=\"c\"/></worldbody></mujoco>')\n"
-        "print(type(simulated_camera(model, 'c', 8, 6)).__name__, gl.problem('egl'))\n"
+        "print(type(simulated_camera(model, 'c', 8, 6)).__name__, opengl.problem('egl'))\n"
     )
     path = os.pathsep.join([str(files.PACKAGE.parent), str(tmp_path)])
     done = in_another_process(program, PYTHONPATH=path, DISPLAY="")

@@ -1,16 +1,10 @@
-"""`TabletopDetector`: the detector that ships, for the things of the catalogue on a table.
+"""`TabletopDetector`: the detector that ships, for the objects of the catalogue on a table.
 
-    found = TabletopDetector()(image)
-
-Its weights are a `.npz` file, trained by `arm5dof vision train`: arrays by their names in the network, normalisation
-folded in, and the names of the classes. Nothing in it is ever unpickled.
+found = TabletopDetector()(image)
 """
 
 from __future__ import annotations
 
-import zipfile
-import zlib
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
@@ -19,137 +13,145 @@ from typing import Any
 import cv2
 import jax
 import numpy as np
-from flax.traverse_util import flatten_dict, unflatten_dict
 
-from arm5dof.errors import UserError
-from arm5dof.runtime import files, xla
-from arm5dof.vision.detections import Detections, check_thresholds, strongest
-from arm5dof.vision.detectors.loading import SHIPPED
-from arm5dof.vision.detectors.tabletop.networks import COARSEST, CROP, Proposer, Refiner
-from arm5dof.vision.detectors.tabletop.proposals import REDUCED, crop, squares, to_picture
+from arm5dof.runtime import xla
+from arm5dof.vision.boxes import mirror, nms
+from arm5dof.vision.detections import Detections, check_thresholds
+from arm5dof.vision.detectors.tabletop.crops import boxes_to_image, crop, crop_squares
+from arm5dof.vision.detectors.tabletop.networks import Proposer, Refiner
+from arm5dof.vision.detectors.tabletop.weights import load_weights
 from arm5dof.vision.images import letterbox, rgb
 
-SIZE = (640, 480)
-"""Width and height of the pictures that it looks at, pixels. Other images are fitted in."""
-PROPOSALS = 40
-"""The most that are looked at closely."""
-LIKELY, POSSIBLE = 0.07, 0.01
-"""Proposals less so are not looked at, but for a careful look, or where they make up a call of the refiner: those less
-than the second never."""
-APART = 0.6
-"""Of proposals that overlap more the likeliest is looked at."""
-TRUST = 0.4
-"""A detection's confidence is the geometric mean of what both networks say, with this weight for the proposer's."""
-LEAST = 0.02
-"""What is less likely a thing is not looked at again."""
-TOGETHER = 4
-"""So many crops are one call of the refiner."""
-NAMES = "class_names"
-DAMAGED = (
-    zipfile.BadZipFile,
-    zipfile.LargeZipFile,
-    zlib.error,
-    ValueError,
-    KeyError,
-    TypeError,
-    EOFError,
-    AttributeError,
-)
-"""What NumPy raises for files that are no archives of arrays."""
+INPUT_SIZE = (640, 480)
+"""Width and height to which images are fitted, pixels; the refiner's crops are taken from that."""
+PROPOSER_SIZE = (320, 240)
+"""Width and height of the image that the proposer sees, pixels."""
+MAX_PROPOSALS = 40
+"""The most that are refined."""
+PROPOSAL_THRESHOLD, PROPOSAL_FLOOR = 0.07, 0.01
+"""Less likely proposals are not refined, but with test-time augmentation, or where they fill up a batch of the refiner:
+those below the second never."""
+PROPOSAL_IOU = 0.6
+"""Of proposals that overlap more, the likeliest is refined."""
+PROPOSER_WEIGHT = 0.4
+"""A detection's confidence is the geometric mean of both networks' scores, the proposer's with this weight."""
+RESCORE_THRESHOLD = 0.02
+"""With test-time augmentation, what is less likely an object is not refined again."""
+BATCH = 4
+"""Crops in one call of the refiner."""
 
 
 class TabletopDetector:
-    """Finds things of the catalogue in images.
+    """Finds objects of the catalogue in images.
 
-    weights:     a file that `arm5dof vision train` wrote; without it, the one that ships
-    confidence:  detections below are dropped
-    iou:         of boxes that overlap more the best stays, whatever their classes: a thing is of one class
-    careful:     look at less likely proposals too, and at what may be a thing twice more, first mirrored, from where it
-                 then seems to be: more is found, and boxes fit better, in twice the time
+    Args:
+        weights: A file that training wrote; None for the one that ships.
+        confidence: Detections below it are dropped, in [0, 1].
+        iou: Of boxes that overlap more the best stays, in [0, 1], whatever their classes: an object is of one class.
+        tta: Test-time augmentation: refine less likely proposals too, and what may be an object three times, once
+            mirrored, and average. More is found, and boxes fit better, in twice the time.
 
-    Raises `UserError` if the file is missing, damaged or of another network.
+    Raises:
+        UserError: The file is missing, damaged or of another network, or a threshold lies outside [0, 1].
     """
 
     def __init__(
-        self, weights: str | Path | None = None, confidence: float = 0.25, iou: float = 0.6, careful: bool = False
+        self, weights: str | Path | None = None, confidence: float = 0.25, iou: float = 0.6, tta: bool = False
     ) -> None:
         check_thresholds(confidence, iou)
-        params, self._class_names = load_weights(SHIPPED if weights is None else weights)
+        params, self._class_names = load_weights(weights)
         self._params = jax.device_put(params)
-        self._confidence, self._iou, self._careful = confidence, iou, careful
+        self._confidence, self._iou, self._tta = confidence, iou, tta
 
     @property
     def class_names(self) -> tuple[str, ...]:
+        """The classes, by their ids."""
         return self._class_names
 
     def __call__(self, image: np.ndarray) -> Detections:
-        """Detections in an RGB uint8 image (h, w, 3)."""
-        boxed = letterbox(rgb(image), SIZE)
-        look = partial(refine, self._params["refiner"], boxed.image)
-        proposed, likely = propose(self._params["proposer"], boxed.image)
-        if not self._careful:
-            count = _filled(int(np.count_nonzero(likely >= LIKELY)))
-            proposed, likely = proposed[:count], likely[:count]
-        boxes, logits = look(proposed)
-        if self._careful:
-            again = self._best(boxes, logits, likely, LEAST)
-            boxes, logits, likely = boxes[again], logits[again], likely[again]
-            once, first = look(boxes, mirrored=True)
-            twice, second = look(once)
-            boxes, logits = (once + twice) / 2, (logits + first + second) / 3
-        found = self._best(boxes, logits, likely, self._confidence)
-        scores = confidences(logits[found], likely[found])
-        return Detections(boxed.to_source(boxes[found]), scores.max(1), scores.argmax(1), self._class_names)
+        """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
+        boxed = letterbox(rgb(image), INPUT_SIZE)
+        refine_here = partial(refine, self._params["refiner"], boxed.image)
+        proposed, objectness = propose(self._params["proposer"], boxed.image)
+        if not self._tta:
+            count = _whole_batches(int(np.count_nonzero(objectness >= PROPOSAL_THRESHOLD)))
+            proposed, objectness = proposed[:count], objectness[:count]
+        boxes, logits = refine_here(proposed)
+        if self._tta:
+            rows = self._best(boxes, logits, objectness, RESCORE_THRESHOLD)
+            boxes, logits, objectness = boxes[rows], logits[rows], objectness[rows]
+            mirrored, mirrored_logits = refine_here(boxes, mirrored=True)
+            again, again_logits = refine_here(mirrored)
+            boxes, logits = (mirrored + again) / 2, (logits + mirrored_logits + again_logits) / 3
+        rows = self._best(boxes, logits, objectness, self._confidence)
+        scores = class_scores(logits[rows], objectness[rows])
+        return Detections(boxed.to_source(boxes[rows]), scores.max(1), scores.argmax(1), self._class_names)
 
-    def _best(self, boxes: np.ndarray, logits: np.ndarray, likely: np.ndarray, least: float) -> np.ndarray:
-        """Which of the boxes (n, 4) are things, at least so confidently: the best wherever several overlap."""
-        scores = confidences(logits, likely).max(1)
-        rows = np.flatnonzero((scores >= least) & (boxes[:, 2:] > boxes[:, :2]).all(1))
-        return rows[strongest(boxes[rows], scores[rows], self._iou)]
-
-
-def confidences(logits: np.ndarray, likely: np.ndarray) -> np.ndarray:
-    """Of each class (n, classes), from the refiner's logits (n, classes) and how likely the proposer thought that there
-    is something (n,)."""
-    return np.asarray((1 + np.exp(-logits)) ** (TRUST - 1) * likely[:, None] ** TRUST)
+    def _best(self, boxes: np.ndarray, logits: np.ndarray, objectness: np.ndarray, threshold: float) -> np.ndarray:
+        """Rows of the boxes (n, 4) that score at least so much: the best wherever several overlap."""
+        scores = class_scores(logits, objectness).max(1)
+        rows = np.flatnonzero((scores >= threshold) & (boxes[:, 2:] > boxes[:, :2]).all(1))
+        return rows[nms(boxes[rows], scores[rows], self._iou)]
 
 
-def propose(params: dict[str, Any], picture: np.ndarray, least: float = POSSIBLE) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (n, 4) of what may be things in a picture, pixels, and how likely they are (n,), the likeliest first and
-    none less than `least`."""
-    reduced = cv2.resize(picture, REDUCED, interpolation=cv2.INTER_AREA)
+def class_scores(logits: np.ndarray, objectness: np.ndarray) -> np.ndarray:
+    """Scores of each class (n, classes), in [0, 1], from the refiner's logits (n, classes) and the proposer's scores of
+    there being an object (n,)."""
+    return np.asarray((1 + np.exp(-logits)) ** (PROPOSER_WEIGHT - 1) * objectness[:, None] ** PROPOSER_WEIGHT)
+
+
+def propose(params: dict[str, Any], image: np.ndarray, floor: float = PROPOSAL_FLOOR) -> tuple[np.ndarray, np.ndarray]:
+    """Find what may be objects.
+
+    Args:
+        params: The proposer's weights, from `fold_batch_norm`.
+        image: RGB uint8, of `INPUT_SIZE`.
+        floor: Less likely proposals are dropped.
+
+    Returns:
+        Boxes (n, 4), pixels, and how likely they hold an object (n,), the likeliest first, at most `MAX_PROPOSALS`.
+    """
+    reduced = cv2.resize(image, PROPOSER_SIZE, interpolation=cv2.INTER_AREA)
     boxes, logits = (np.asarray(x) for x in _proposer()(params, reduced))
-    rows = np.flatnonzero(logits > np.log(least / (1 - least)))
-    boxes, likely = boxes[rows] * (picture.shape[1] / REDUCED[0]), 1 / (1 + np.exp(-logits[rows]))
-    kept = strongest(boxes, likely, APART)[:PROPOSALS]
-    return boxes[kept], likely[kept]
+    rows = np.flatnonzero(logits > np.log(floor / (1 - floor)))
+    boxes, objectness = boxes[rows] * (image.shape[1] / PROPOSER_SIZE[0]), 1 / (1 + np.exp(-logits[rows]))
+    kept = nms(boxes, objectness, PROPOSAL_IOU)[:MAX_PROPOSALS]
+    return boxes[kept], objectness[kept]
 
 
 def refine(
-    params: dict[str, Any], picture: np.ndarray, proposed: np.ndarray, mirrored: bool = False
+    params: dict[str, Any], image: np.ndarray, proposed: np.ndarray, mirrored: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (n, 4), pixels, and logits (n, classes) of what lies in the proposed boxes (n, 4), looked at as it is or
-    mirrored, left and right."""
+    """Classify what is in proposed boxes, and fit the boxes to it.
+
+    Args:
+        params: The refiner's weights, from `fold_batch_norm`.
+        image: RGB uint8, of `INPUT_SIZE`.
+        proposed: Boxes (n, 4), pixels.
+        mirrored: Show the network mirrored crops, left and right exchanged.
+
+    Returns:
+        Boxes (n, 4), pixels, and logits (n, classes).
+    """
     count, classes = len(proposed), params["logits"]["bias"].size
     if not count:
         return np.empty((0, 4)), np.empty((0, classes))
-    where = squares(proposed)
+    squares = crop_squares(proposed)
 
-    def look(rows: np.ndarray) -> list[np.ndarray]:
-        crops = np.stack([crop(picture, where[i]) for i in rows])
+    def refine_batch(rows: np.ndarray) -> list[np.ndarray]:
+        crops = np.stack([crop(image, squares[i]) for i in rows])
         crops = np.flip(crops, 2) if mirrored else crops
-        return [np.asarray(x) for x in _refiner()(params, crops, where[rows, 2].astype(np.float32))]
+        return [np.asarray(x) for x in _refiner()(params, crops, squares[rows, 2].astype(np.float32))]
 
-    rows = np.minimum(np.arange(_filled(count)), count - 1).reshape(-1, TOGETHER)
-    shares, logits = (np.concatenate(parts)[:count] for parts in zip(*_threads().map(look, rows), strict=True))
-    if mirrored:
-        shares[:, [0, 2]] = 1 - shares[:, [2, 0]]
-    return to_picture(shares, where), logits
+    rows = np.minimum(np.arange(_whole_batches(count)), count - 1).reshape(-1, BATCH)
+    batches = _threads().map(refine_batch, rows)
+    relative, logits = (np.concatenate(parts)[:count] for parts in zip(*batches, strict=True))
+    return boxes_to_image(mirror(relative, 1) if mirrored else relative, squares), logits
 
 
-def _filled(count: int) -> int:
-    """How many crops the calls hold that so many take."""
-    return -(-count // TOGETHER) * TOGETHER
+def _whole_batches(count: int) -> int:
+    """How many crops are in the batches that so many crops take."""
+    return -(-count // BATCH) * BATCH
 
 
 @cache
@@ -160,11 +162,11 @@ def _threads() -> ThreadPoolExecutor:
 
 @cache
 def _proposer() -> Any:
-    """Weights and a reduced picture to boxes (n, 4) and logits (n,)."""
+    """The compiled proposer: weights and an image of `PROPOSER_SIZE` to boxes (n, 4) and logits (n,)."""
 
-    def forward(params: dict[str, Any], picture: jax.Array) -> tuple[jax.Array, jax.Array]:
-        found: Any = Proposer(normalised=False).apply({"params": params}, picture[None])
-        (boxes,), (logits,) = found
+    def forward(params: dict[str, Any], image: jax.Array) -> tuple[jax.Array, jax.Array]:
+        outputs: Any = Proposer(False).apply({"params": params}, image[None])
+        (boxes,), (logits,) = outputs
         return boxes, logits
 
     return jax.jit(forward, compiler_options=xla.fusion_emitters())
@@ -172,47 +174,9 @@ def _proposer() -> Any:
 
 @cache
 def _refiner() -> Any:
-    """Weights, crops (n, CROP, CROP, 3) and their widths (n,) to boxes (n, 4) and logits (n, classes)."""
+    """The compiled refiner: weights, crops (n, CROP, CROP, 3) and their widths (n,) to boxes (n, 4) and logits."""
 
     def forward(params: dict[str, Any], crops: jax.Array, widths: jax.Array) -> Any:
-        return Refiner(params["logits"]["bias"].size, normalised=False).apply({"params": params}, crops, widths)
+        return Refiner(params["logits"]["bias"].size, False).apply({"params": params}, crops, widths)
 
     return jax.jit(forward, compiler_options=xla.fusion_emitters())
-
-
-def save_weights(path: Path, params: dict[str, Any], class_names: Sequence[str]) -> None:
-    """Write folded weights atomically, rounded to half precision. The same weights give the same bits."""
-    arrays = {name: np.asarray(value, np.float16) for name, value in flatten_dict(params, sep="/").items()}
-    with files.replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **{NAMES: np.array(class_names)}, **arrays)
-
-
-def load_weights(path: str | Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Folded weights in single precision, and the names of the classes. Raises `UserError`."""
-    path = Path(path)
-    if not path.is_file():
-        raise UserError(f"no weights {str(path)!r}: give a file that arm5dof vision train wrote")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        class_names = tuple(str(name) for name in arrays.pop(NAMES))
-        arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
-    except DAMAGED:
-        raise UserError(
-            f"{path} is damaged, or no weights of this detector: train them with arm5dof vision train"
-        ) from None
-    shapes = {name: value.shape for name, value in arrays.items()}
-    if shapes != _shapes(len(class_names)) or not all(np.isfinite(value).all() for value in arrays.values()):
-        raise UserError(f"{path} holds other weights than the network has: train them anew with arm5dof vision train")
-    return unflatten_dict(arrays, sep="/"), class_names
-
-
-@cache
-def _shapes(classes: int) -> dict[str, tuple[int, ...]]:
-    picture, crops = (np.zeros((1, side, side, 3), np.uint8) for side in (COARSEST, CROP))
-    made = {
-        "proposer": jax.eval_shape(Proposer(normalised=False).init, jax.random.key(0), picture),
-        "refiner": jax.eval_shape(Refiner(classes, False).init, jax.random.key(0), crops, np.ones(1, np.float32)),
-    }
-    params = {name: variables["params"] for name, variables in made.items()}
-    return {name: value.shape for name, value in flatten_dict(params, sep="/").items()}

@@ -1,4 +1,4 @@
-"""The parts of YOLOv5 v6 in JAX, as published, with batch normalisation folded into the convolutions.
+"""The parts of YOLOv5 v6 in JAX, as published, with batch normalization folded into the convolutions.
 
 Feature maps are (batch, height, width, channels). Each layer is a pytree of its weights; what shapes the program is
 static.
@@ -18,7 +18,7 @@ def _convolve(x: jax.Array, weight: jax.Array, stride: tuple[int, int], padding:
     return jax.lax.conv_general_dilated(x, weight, stride, [(p, p) for p in padding], dimension_numbers=layout)
 
 
-def _blocks(x: jax.Array) -> jax.Array:
+def _space_to_depth(x: jax.Array) -> jax.Array:
     """Blocks of 2 x 2 as channels: (2 height, 2 width, channels, ...) to (height, width, 4 channels, ...)."""
     return jnp.concatenate([x[i::2, j::2] for i in (0, 1) for j in (0, 1)], axis=2)
 
@@ -38,7 +38,7 @@ class Conv(struct.PyTreeNode):
             x = x @ self.weight[0, 0]  # XLA's convolutions on a CPU do not see that this is all there is to it.
         elif self.weight.shape[:2] == (6, 6) and (self.stride, self.padding) == ((2, 2), (2, 2)):
             # The first layer, on three channels. The same sum over blocks of 2 x 2 pixels takes two thirds of its time.
-            x = _convolve(_blocks(x[0])[None], _blocks(self.weight), (1, 1), (1, 1))
+            x = _convolve(_space_to_depth(x[0])[None], _space_to_depth(self.weight), (1, 1), (1, 1))
         else:
             x = _convolve(x, self.weight, self.stride, self.padding)
         x = x + self.bias
@@ -116,7 +116,7 @@ class Detect(struct.PyTreeNode):
     """Pixels per cell of each scale."""
 
     def __call__(self, *maps: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Boxes (n, 4), centre and size in pixels, and scores (n, classes), of the first image in the batch: by
+        """Boxes (n, 4), center and size in pixels, and scores (n, classes), of the first image in the batch: by
         scale, anchor, row and column, the published order."""
         boxes, scores = [], []
         for conv, anchors, stride, x in zip(self.convs, self.anchors, self.strides, maps, strict=True):
@@ -124,9 +124,9 @@ class Detect(struct.PyTreeNode):
             weights = jnp.split(conv.weight[0, 0], len(anchors), axis=-1)
             for weight, bias, anchor in zip(weights, jnp.split(conv.bias, len(anchors)), anchors, strict=True):
                 y = jax.nn.sigmoid(x[0] @ weight + bias)
-                centre = (2 * y[..., :2] - 0.5 + grid) * stride
+                center = (2 * y[..., :2] - 0.5 + grid) * stride
                 size = (2 * y[..., 2:4]) ** 2 * anchor
-                boxes.append(jnp.concatenate([centre, size], axis=-1).reshape(-1, 4))
+                boxes.append(jnp.concatenate([center, size], axis=-1).reshape(-1, 4))
                 scores.append((y[..., 4:5] * y[..., 5:]).reshape(-1, y.shape[-1] - 5))
         return jnp.concatenate(boxes), jnp.concatenate(scores)
 

@@ -1,7 +1,7 @@
 """YOLOv5 v6 in JAX, straight from the published weights: n, s, m, l, x and whatever was trained from them.
 
 The network is built from the modules that the file lists, so widths, depths and the number of scales are the file's.
-Decoding and suppression are the published ones.
+Decoding and non-maximum suppression are the published ones.
 """
 
 from __future__ import annotations
@@ -18,21 +18,20 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import xla
-from arm5dof.vision.detections import Detections, check_thresholds, suppress
-from arm5dof.vision.detectors.yolov5 import pt_reader as torch_file
+from arm5dof.vision.detections import Detections, check_thresholds
 from arm5dof.vision.detectors.yolov5.layers import C3, SPPF, Bottleneck, Concat, Conv, Detect, Network, Upsample
-from arm5dof.vision.detectors.yolov5.pt_reader import Module
+from arm5dof.vision.detectors.yolov5.pt_reader import Module, read_pt
 from arm5dof.vision.images import check_size, letterbox, rgb
 
 
 def _conv(module: Module) -> Conv:
-    """A published `Conv` (convolution, batch normalisation, SiLU), or a bare convolution, as one convolution."""
+    """A published `Conv` (convolution, batch normalization, SiLU), or a bare convolution, as one convolution."""
     if module.kind.endswith(".Conv2d"):
         return _bare(module, module.get("bias"), activated=False)
     if (activation := module.get("act").kind) != "torch.nn.modules.activation.SiLU":
         raise UserError(f"the network's activation is {activation}: only SiLU, which YOLOv5 v6 uses, is supported")
     conv = _bare(module.get("conv"), None, activated=True)
-    if not module.has("bn"):  # The file was saved with the normalisation folded in already.
+    if not module.has("bn"):  # The file was saved with the normalization folded in already.
         return replace(conv, bias=jnp.asarray(module.get("conv").get("bias"), jnp.float32))
     norm = module.get("bn")
     mean, variance, weight, bias = (
@@ -91,9 +90,16 @@ def _layer_of(module: Module) -> Any:
     return LAYERS[module.kind](module)
 
 
-def build(path: str | Path) -> tuple[Network, tuple[str, ...]]:
-    """The network in a `.pt` file, and the names of its classes. Raises `UserError` if it holds no YOLOv5 v6."""
-    saved = torch_file.load(path)
+def load_network(path: str | Path) -> tuple[Network, tuple[str, ...]]:
+    """Build the network in a `.pt` file.
+
+    Returns:
+        The network, and the names of its classes.
+
+    Raises:
+        UserError: The file is missing, damaged, or holds no YOLOv5 v6.
+    """
+    saved = read_pt(path)
     try:
         model = saved.get("ema") or saved["model"]
         modules = model.get("model").children()
@@ -124,13 +130,18 @@ def _program() -> Callable[[Network, np.ndarray], tuple[jax.Array, jax.Array]]:
 class YOLOv5:
     """A detector with the weights of a YOLOv5 v6 `.pt` file.
 
-    path:        the file
-    class_names: names of the network's classes; without them, those in the file
-    confidence:  detections below are dropped
-    iou:         of boxes of one class that overlap more, the best stays
-    size:        longer side of the network's input, pixels; a multiple of the largest stride, 32 or 64
-    square:      a square input whatever the image, one program for all; without it the shorter side is only as long
-                 as the image needs, one program for each aspect, and 4:3 images take three quarters of the time
+    Args:
+        path: The file.
+        class_names: Names of the network's classes; None for those in the file.
+        confidence: Detections below it are dropped, in [0, 1].
+        iou: Of boxes of one class that overlap more, the best stays, in [0, 1].
+        size: Longer side of the network's input, pixels: a multiple of the largest stride, 32 or 64.
+        square: Use a square input whatever the image, one program for all. Otherwise the shorter side is only as long
+            as the image needs, with one program for each aspect ratio, and 4:3 images take three quarters of the time.
+
+    Raises:
+        UserError: The file is missing, damaged, or holds no YOLOv5 v6; it has another number of classes than were
+            named; the size is no such multiple; or a threshold lies outside [0, 1].
     """
 
     def __init__(
@@ -143,7 +154,7 @@ class YOLOv5:
         square: bool = True,
     ) -> None:
         check_thresholds(confidence, iou)
-        self._network, names = build(path)
+        self._network, names = load_network(path)
         if class_names is not None and len(class_names) != len(names):
             raise UserError(
                 f"{path} tells {len(names)} classes apart, and {len(class_names)} names were given: give one name for "
@@ -156,16 +167,23 @@ class YOLOv5:
 
     @property
     def class_names(self) -> tuple[str, ...]:
+        """The classes, by their ids."""
         return self._class_names
 
     def __call__(self, image: np.ndarray) -> Detections:
-        """Detections in an RGB uint8 image (h, w, 3)."""
+        """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
         boxed = letterbox(rgb(image), (self._size, self._size), None if self._square else self._stride)
         boxes, scores = (np.asarray(x) for x in self.forward(boxed.image))
-        found = suppress(boxes, scores, self._class_names, self._confidence, self._iou)
+        found = Detections.from_scores(boxes, scores, self._class_names, self._confidence, self._iou)
         return replace(found, xyxy=boxed.to_source(found.xyxy))
 
     def forward(self, image: np.ndarray) -> tuple[jax.Array, jax.Array]:
-        """Every box (n, 4), centre and size in pixels, and its scores (n, classes), in an image of a size that the
-        network takes."""
+        """The network's output.
+
+        Args:
+            image: RGB uint8 (h, w, 3), height and width multiples of the largest stride.
+
+        Returns:
+            Every box (n, 4), center and size in pixels, and its scores (n, classes).
+        """
         return _program()(self._network, image)

@@ -150,10 +150,14 @@ class _Ignored(metaclass=_Inert):
         pass
 
 
-def load(path: str | Path) -> Any:
-    """The object in a `.pt` file: dicts, lists, numbers, `Tensor`s and `Module`s.
+def read_pt(path: str | Path) -> Any:
+    """Read the object in a `.pt` file, as PyTorch 1.6 and later write it.
 
-    Raises `UserError` if the file is not PyTorch's, is damaged, or names a class or function outside the list.
+    Returns:
+        Dicts, lists, numbers, `Tensor`s and `Module`s.
+
+    Raises:
+        UserError: The file is missing, not PyTorch's, damaged, or names a class or function outside the list.
     """
     path = Path(path)
     if not path.is_file():

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from arm5dof.errors import UserError
-from arm5dof.vision.detectors.yolov5 import pt_reader as torch_file
+from arm5dof.vision.detectors.yolov5.pt_reader import OPCODES, read_pt
 
 
 def test_values_and_tensors_come_back(tmp_path):
@@ -26,7 +26,7 @@ def test_values_and_tensors_come_back(tmp_path):
         "scalar": np.array(7, np.int64),
         "empty": np.zeros((0, 3)),
     }
-    loaded = torch_file.load(save(tmp_path / "x.pt", saved, writer))
+    loaded = read_pt(save(tmp_path / "x.pt", saved, writer))
     assert loaded["a"] == [1, -2.5, None, True, "text", (1, 2)]
     for name in ("whole", "scalar", "empty"):
         np.testing.assert_array_equal(loaded[name].array, saved[name])
@@ -40,7 +40,7 @@ def test_modules_are_shells(tmp_path):
     weight = np.ones((2, 3), np.float32)
     conv = Shell("torch.nn.modules.conv.Conv2d", _parameters={"weight": weight}, _buffers={}, _modules={}, groups=1)
     model = Shell("models.common.Conv", _parameters={}, _buffers={}, _modules={"conv": conv}, i=4)
-    loaded = torch_file.load(save(tmp_path / "x.pt", {"model": model}))["model"]
+    loaded = read_pt(save(tmp_path / "x.pt", {"model": model}))["model"]
     assert loaded.kind == "models.common.Conv" and loaded.get("i") == 4 and loaded.has("conv")
     assert [child.kind for child in loaded.children()] == ["torch.nn.modules.conv.Conv2d"]
     np.testing.assert_array_equal(loaded.get("conv").get("weight"), weight)
@@ -50,7 +50,7 @@ def test_modules_are_shells(tmp_path):
 
 
 def test_the_published_weights(test_data):
-    saved = torch_file.load(test_data / "vision" / "models" / "yolov5n.pt")
+    saved = read_pt(test_data / "vision" / "models" / "yolov5n.pt")
     model = saved["model"]
     assert model.kind == "models.yolo.Model" and len(model.get("names")) == 80
     first = model.get("model").children()[0].get("conv").get("weight")
@@ -113,7 +113,7 @@ def test_malicious_pickles_run_nothing(tmp_path, name):
     marker = tmp_path / "was here"
     attack = dict(attacks(f"touch '{marker}'"))[name]
     with pytest.raises(UserError, match=r"x\.pt is (refused|damaged)"):
-        torch_file.load(save(tmp_path / "x.pt", attack))
+        read_pt(save(tmp_path / "x.pt", attack))
     assert not marker.exists()
 
 
@@ -130,7 +130,7 @@ def test_those_pickles_would_have_run(tmp_path):
 def test_harmless_shells_are_all_that_is_left_of_training_records(tmp_path):
     dtype = Raw(named("numpy", "dtype") + Writer().write(("f8", False, True)) + b"R" + Writer().write((3, "<")) + b"b")
     value = Raw(named("numpy.core.multiarray", "scalar") + b"(" + dtype + Writer().write("8 bytes") + b"tR")
-    loaded = torch_file.load(save(tmp_path / "x.pt", {"best_fitness": value, "epoch": 3}))
+    loaded = read_pt(save(tmp_path / "x.pt", {"best_fitness": value, "epoch": 3}))
     assert loaded["epoch"] == 3 and not isinstance(loaded["best_fitness"], np.generic)
 
 
@@ -158,7 +158,7 @@ def test_tensors_stay_inside_their_storage(tmp_path, offset, size, stride, numel
     writer = Writer()
     tensor = writer.tensor(np.zeros(6, np.float32), offset, size, stride, numel)
     with pytest.raises(UserError, match=r"is (refused|damaged)"):
-        torch_file.load(save(tmp_path / "x.pt", tensor, writer))
+        read_pt(save(tmp_path / "x.pt", tensor, writer))
 
 
 def test_one_storage_has_one_type(tmp_path):
@@ -167,7 +167,7 @@ def test_one_storage_has_one_type(tmp_path):
     writer.records.clear()
     double = writer.tensor(np.zeros(8, np.float64), 0, (8,), (1,))
     with pytest.raises(UserError, match=r"size that the file states|too large|damaged"):
-        torch_file.load(save(tmp_path / "x.pt", [double, single], writer))
+        read_pt(save(tmp_path / "x.pt", [double, single], writer))
 
 
 def test_foreign_files_are_one_clear_line(tmp_path):
@@ -181,7 +181,7 @@ def test_foreign_files_are_one_clear_line(tmp_path):
     save(tmp_path / "squeezed.pt", [0] * 1000, compression=zipfile.ZIP_DEFLATED)
     for name in ("cut", "text", "empty", "bare", "other", "squeezed", "nowhere"):
         with pytest.raises(UserError, match=f"{name}.pt") as raised:
-            torch_file.load(tmp_path / f"{name}.pt")
+            read_pt(tmp_path / f"{name}.pt")
         assert "\n" not in str(raised.value)
 
 
@@ -197,10 +197,10 @@ def test_any_damage_is_a_user_error_or_harmless(tmp_path, at, byte, cut):
         content[at] = byte
     (tmp_path / "x.pt").write_bytes(content)
     try:
-        torch_file.load(tmp_path / "x.pt")
+        read_pt(tmp_path / "x.pt")
     except UserError as error:
         assert "x.pt" in str(error)
 
 
 def test_the_opcodes_allowed_are_pythons_own():
-    assert {opcode.name for opcode in pickletools.opcodes} > torch_file.OPCODES
+    assert {opcode.name for opcode in pickletools.opcodes} > OPCODES
