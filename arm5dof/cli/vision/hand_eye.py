@@ -77,7 +77,7 @@ def run(known: argparse.Namespace, rest: list[str]) -> None:
     if known.on_hand:
         rotation, position = np.asarray(camera.rotation, float), np.asarray(camera.position, float)
         notes |= {"hand_rotation": rotation, "hand_position": position.reshape(3, 1)}
-    camera.replace(posed=not known.on_hand).save(known.out, notes)
+    camera.replace(has_extrinsics=not known.on_hand).save(known.out, notes)
 
     frame = "hand" if known.on_hand else "base"
     if known.json:

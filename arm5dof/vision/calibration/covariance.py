@@ -1,4 +1,4 @@
-"""How well a camera is known: the covariance of what calibration estimates, in the order of `Camera.disturbed`.
+"""How well a camera is known: the covariance of what calibration estimates, in the order of `Camera.perturbed`.
 
 Standard deviations alone will not do. Errors of the focal length, the distortion and the pose hang together, and most
 of what they do to a pixel cancels; taken one by one they would make a camera look several times worse than it is.
@@ -47,7 +47,7 @@ def with_pose(camera: Camera, solve: Callable[[Camera], np.ndarray], noise: np.n
         if deviation:
             error = np.zeros(len(lens) + 6)
             error[i] = deviation
-            more, less = (_step(pose, solve(camera.disturbed(sign * error))) for sign in (1, -1))
+            more, less = (_step(pose, solve(camera.perturbed(sign * error))) for sign in (1, -1))
             follows[:, i] = (more - less) / (2 * deviation)
     both = lens @ follows.T
     return posed.replace(covariance=np.block([[lens, both], [both.T, follows @ both + noise]]))
@@ -74,7 +74,7 @@ def carried(placed: tuple[float, float], board: np.ndarray) -> np.ndarray:
 
 def linearise(camera: Camera, corners: Corners, board: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What separates the corners of a board at the pose `board` (4, 4) in the camera's frame from where they were seen,
-    (2n,) pixels, and its derivative by the errors that `Camera.disturbed` takes, (2n, m)."""
+    (2n,) pixels, and its derivative by the errors that `Camera.perturbed` takes, (2n, m)."""
     turn, _ = cv2.Rodrigues(board[:3, :3])
     lens = np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
     pixels, jacobian = cv2.projectPoints(corners.points, turn, board[:3, 3], *lens)

@@ -153,7 +153,7 @@ def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, fla
         flags=flags | COUNT_FLAGS[coefficients],
     )
     return Calibration(
-        Camera(matrix, distortion.ravel()[:coefficients], np.eye(3), np.zeros(3), *size, posed=False),
+        Camera(matrix, distortion.ravel()[:coefficients], np.eye(3), np.zeros(3), *size, has_extrinsics=False),
         float(rms),
         deviations.ravel()[: 4 + coefficients],
         {view.name: float(error) for view, error in zip(views, errors.ravel(), strict=True)},

@@ -142,7 +142,7 @@ def _by_depth(
         def estimate(
             box: jax.Array, error: jax.Array, half_height: jax.Array, offset: jax.Array
         ) -> tuple[jax.Array, Any]:
-            seen = camera.disturbed(error)
+            seen = camera.perturbed(error)
             found = explain([seen], box[None], half_height[0], thing.form, start, table, pixels)
             given = seen, jnp.append(found.radii[0], half_height), offset
             frozen = jax.lax.stop_gradient(given)

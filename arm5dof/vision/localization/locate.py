@@ -108,7 +108,7 @@ def _by_plane(given: tuple[jax.Array, Things], camera: Camera, table: float, pix
         start, slope = on_plane(camera, box, table + thing.half_height)
 
         def estimate(box: jax.Array, error: jax.Array, half_height: jax.Array) -> tuple[jax.Array, Any]:
-            seen = [camera.disturbed(error)]
+            seen = [camera.perturbed(error)]
             found = explain(seen, box[None], half_height[0], thing.form, start, table, pixels)
             return found.middle, (found.middle, found.misfit)
 
@@ -160,7 +160,7 @@ def check(camera: Camera, pixels: float) -> None:
     """Raise `UserError` if nobody has said where the camera stands, or if boxes are said to be exact."""
     if not 0 < pixels < math.inf:
         raise UserError(f"the standard deviation of a box's edges is a number of pixels above zero, not {pixels:g}")
-    if not camera.posed:
+    if not camera.has_extrinsics:
         raise UserError("nobody has said where the camera stands: find its pose with arm5dof vision pose or hand-eye")
 
 

@@ -97,7 +97,7 @@ def _by_views(given: tuple[jax.Array, Things], cameras: tuple[Camera, ...], pixe
         start = _nearest(cameras, rays)
 
         def estimate(boxes: jax.Array, half_height: jax.Array, *errors: jax.Array) -> tuple[jax.Array, Any]:
-            seen = [camera.disturbed(error) for camera, error in zip(cameras, errors, strict=True)]
+            seen = [camera.perturbed(error) for camera, error in zip(cameras, errors, strict=True)]
             found = explain(seen, boxes.reshape(-1, 4), half_height[0], thing.form, start, None, pixels)
             return found.middle, (found.middle, found.misfit)
 

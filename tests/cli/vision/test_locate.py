@@ -34,10 +34,10 @@ def folder(tmp_path_factory):
     ids, depth = tabletop.cast(model, data, camera)
     found = detections(tabletop.boxes(model, ids, 3), names)
     camera.save(folder / "posed.yml")
-    camera.replace(posed=False).save(folder / "unposed.yml")
+    camera.replace(has_extrinsics=False).save(folder / "unposed.yml")
     camera.replace(covariance=None).save(folder / "bare.yml")
     hand = {"hand_rotation": camera.rotation, "hand_position": camera.position.reshape(3, 1)}
-    camera.replace(posed=False).save(folder / "on_hand.yml", hand)
+    camera.replace(has_extrinsics=False).save(folder / "on_hand.yml", hand)
     (folder / "list.json").write_text(found.to_json())
     frame = {"name": "a.jpg", "time_s": None, "image_size": [640, 480], "detections": json.loads(found.to_json())}
     (folder / "frames.json").write_text(json.dumps([frame, {**frame, "name": "b.jpg", "detections": []}]))

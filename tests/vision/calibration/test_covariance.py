@@ -27,7 +27,7 @@ def test_deviations_are_opencvs_own(test_data):
     result = calibrate(find_views(paths, Checkerboard(9, 6, 0.025)))
     deviations = np.sqrt(np.diag(result.camera.covariance))
     np.testing.assert_allclose(deviations[:9], result.deviations, rtol=1e-4)
-    assert not deviations[9:].any() and not result.camera.posed
+    assert not deviations[9:].any() and not result.camera.has_extrinsics
 
 
 def test_intrinsics_and_pose_are_off_as_stated():
@@ -63,6 +63,6 @@ def test_a_board_out_of_place_takes_the_camera_with_it():
 
 
 def test_a_camera_of_which_nothing_is_known_stays_one():
-    camera = Camera(*LENS, np.eye(3), np.zeros(3), WIDTH, HEIGHT, posed=False)
+    camera = Camera(*LENS, np.eye(3), np.zeros(3), WIDTH, HEIGHT, has_extrinsics=False)
     posed = uncertainty.with_pose(camera, lambda c: pose(np.eye(3), [0, 0, 1]), np.eye(6))
-    assert posed.posed and posed.covariance is None and posed.position[2] == 1
+    assert posed.has_extrinsics and posed.covariance is None and posed.position[2] == 1

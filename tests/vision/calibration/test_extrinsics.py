@@ -37,7 +37,7 @@ def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
     expected = board_to_base @ np.linalg.inv(pose)
     np.testing.assert_allclose(camera.position, expected[:3, 3], atol=1e-3)
     np.testing.assert_allclose(camera.rotation, expected[:3, :3], atol=3e-3)
-    assert camera.posed and camera.position[2] > 0.3
+    assert camera.has_extrinsics and camera.position[2] > 0.3
 
     with pytest.raises(UserError, match="640x480 pixels and the camera 320x240"):
         from_board(TRUE.replace(width=320, height=240), path, board, board_to_base)
@@ -88,7 +88,7 @@ def test_a_moving_hand_tells_where_the_camera_is(shots, on_hand):
     np.testing.assert_allclose(found.camera.position, CAMERA[:3, 3], atol=2e-3)
     np.testing.assert_allclose(found.camera.rotation, CAMERA[:3, :3], atol=5e-3)
     assert found.without == [paths[-1].name] and len(found.used) == len(paths) - 1
-    assert told[-1] == (len(paths), paths[-1].name) and found.camera.posed
+    assert told[-1] == (len(paths), paths[-1].name) and found.camera.has_extrinsics
     # The pose's own deviations, and on top of them what those of the intrinsics do to it.
     with_lens = np.sqrt(np.diag(found.camera.covariance)[-6:])
     assert (with_lens > np.sqrt(np.diag(found.hand_eye.covariance))).all() and (with_lens < 0.01).all()
@@ -102,7 +102,7 @@ def test_the_pose_command(tmp_path, capsys):
     """A board on the table, its rows along the base's y axis; or held upright, said by a quaternion."""
     seen = next(poses(np.random.default_rng(4), 1, (0.1, 0.06)))
     cv2.imwrite(str(tmp_path / "board.png"), photograph(*draw(BOARD), seen))
-    KNOWN.replace(posed=False).save(tmp_path / "camera.yml")
+    KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")
     words = ["pose", tmp_path / "camera.yml", tmp_path / "board.png", "--board", "8x5", "--square", "0.03"]
     quaternion = Rotation.from_euler("xyz", [0.3, 0.5, 0.7])
     w = np.roll(quaternion.as_quat(), 1)
@@ -127,7 +127,7 @@ def test_the_pose_command(tmp_path, capsys):
     assert command(*words, "--at", 0.2, 0.1, 0, 90, "--out", tmp_path / "d.yml") == 0
     said = capsys.readouterr().out
     assert "stands at" in said and "+-" in said and said.endswith(f"camera: {tmp_path / 'd.yml'}\n")
-    TRUE.replace(posed=False).save(tmp_path / "bare.yml")
+    TRUE.replace(has_extrinsics=False).save(tmp_path / "bare.yml")
     words[1] = tmp_path / "bare.yml"
     assert command(*words, "--at", 0.2, 0.1, 0, 90, "--out", tmp_path / "e.yml") == 0
     assert "how well is unknown" in capsys.readouterr().out and Camera.load(tmp_path / "e.yml").covariance is None
@@ -140,20 +140,20 @@ def test_the_hand_eye_command(shots, flag, tmp_path, capsys, monkeypatch):
     paths, seen = shots
     arm = hands(seen, flag == "--on-hand")
     table = write_poses(paths[0].parent / f"poses{flag}.csv", arm, [path.name for path in paths])
-    KNOWN.replace(posed=False).save(tmp_path / "camera.yml")
+    KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")
     words = ["hand-eye", tmp_path / "camera.yml", table, flag, "--board", "8x5", "--square", "0.03"]
     assert command(*words, "--out", tmp_path / "out.yml") == 0
     said, seen_meanwhile = capsys.readouterr()
     assert "looking for the board: 11/11 photographs" in seen_meanwhile
     assert "10 photographs" in said and "10.png: left out: board not found" in said
     if flag == "--on-hand":
-        assert "in the hand frame" in said and not Camera.load(tmp_path / "out.yml").posed
+        assert "in the hand frame" in said and not Camera.load(tmp_path / "out.yml").has_extrinsics
         camera, true = Camera.load(tmp_path / "out.yml", arm[2]), arm[2] @ CAMERA
     else:
         camera, true = Camera.load(tmp_path / "out.yml"), CAMERA
     np.testing.assert_allclose(camera.position, true[:3, 3], atol=2e-3)
     np.testing.assert_allclose(camera.rotation, true[:3, :3], atol=5e-3)
-    assert camera.posed and camera.covariance is not None
+    assert camera.has_extrinsics and camera.covariance is not None
     assert command(*words, "--out", tmp_path / "again.yml", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["frame"] == ("hand" if flag == "--on-hand" else "base")
@@ -169,7 +169,7 @@ def write_poses(path, arm, names):
 
 def test_bad_input_is_one_line(shots, tmp_path, capfd):
     paths, seen = shots
-    KNOWN.replace(posed=False).save(tmp_path / "camera.yml")
+    KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")
     (tmp_path / "there.yml").write_text("precious")
     good = write_poses(paths[0].parent / "good.csv", hands(seen, True), [path.name for path in paths])
     lines = good.read_text().splitlines()

@@ -40,7 +40,7 @@ def test_thirteen_photographs_give_a_camera(views):
     assert abs(cx - 342.4) <= 2 and abs(cy - 233.2) <= 2
     assert (result.deviations[:4] > 0.1).all() and (result.deviations[:4] < 0.6).all()
     assert list(result.errors) == [view.name for view in views.found]
-    assert (result.camera.width, result.camera.height, result.camera.posed) == (640, 480, False)
+    assert (result.camera.width, result.camera.height, result.camera.has_extrinsics) == (640, 480, False)
 
 
 def test_opencvs_published_calibration_is_reproduced_with_its_settings(photographs, views, test_data):
@@ -228,7 +228,7 @@ def test_the_command_writes_a_camera_and_tells_how_well_it_is_known(photographs,
     assert all(path.name in said for path in photographs)
     assert "fx          532.90 +- 0.41 pixels" in said and "error 0.185 pixels RMS" in said
     camera = Camera.load(out)
-    assert abs(camera.matrix[0, 0] - 532.3) <= 1 and not camera.posed
+    assert abs(camera.matrix[0, 0] - 532.3) <= 1 and not camera.has_extrinsics
     assert picture.read_bytes().startswith(b"\x89PNG") and {out, picture} == set(tmp_path.iterdir())
 
     assert command(*photographs, *words[1:5], "--out", tmp_path / "again.yml", "--json") == 0

@@ -63,7 +63,7 @@ def test_the_stated_covariance_is_that_of_the_errors():
         camera, boxes, middles, depth, shows = scene(rng, names)
         _, known = tabletop.calibrated_and_posed(rng)
         error = rng.multivariate_normal(np.zeros(15), known.covariance, method="svd")
-        taken = camera.disturbed(error).replace(covariance=known.covariance)
+        taken = camera.perturbed(error).replace(covariance=known.covariance)
         solids = {n: replace(s, half_height=s.half_height + s.deviation * rng.normal()) for n, s in SOLIDS.items()}
         depth = depth + np.append(0, 2e-3 * rng.normal(size=4))[shows] + 1e-3 * rng.normal(size=depth.shape)
         found = by_depth(detections(boxes + rng.normal(size=(4, 4)), names), depth, taken, solids, deviation=2e-3)
@@ -112,7 +112,7 @@ def test_without_depth_there_is_a_reason():
     with pytest.raises(UserError, match="has 320x480 pixels and the camera 640x480"):
         by_depth(found, depth[:, :320], camera, SOLIDS)
     with pytest.raises(UserError, match="nobody has said where the camera stands"):
-        by_depth(found, depth, camera.replace(posed=False), SOLIDS)
+        by_depth(found, depth, camera.replace(has_extrinsics=False), SOLIDS)
 
 
 def test_depth_images_are_millimetres_in_sixteen_bits(tmp_path):

@@ -133,7 +133,7 @@ def test_the_stated_covariance_is_that_of_the_errors():
 
 
 def test_the_covariance_is_made_of_derivatives():
-    """By the edges, taken by locating again with each a little off; by the height; by the camera, disturbed."""
+    """By the edges, taken by locating again with each a little off; by the height; by the camera, perturbed."""
     rng = np.random.default_rng(3)
     names = ["can", "ball"]
     with jax.enable_x64(True):
@@ -160,7 +160,7 @@ def test_the_covariance_is_made_of_derivatives():
         scale = np.array([1, 1, 1, 1, 0.01, 0.01, 1e-3, 1e-3, 0.01, *[1e-3] * 6])
         by_camera = np.stack(
             [
-                (position(camera=camera.disturbed(s)) - position(camera=camera.disturbed(-s))) / 0.1
+                (position(camera=camera.perturbed(s)) - position(camera=camera.perturbed(-s))) / 0.1
                 for s in 0.05 * np.diag(scale)
             ],
             -1,
@@ -226,7 +226,7 @@ def test_any_number_of_things_and_heights_as_plain_numbers():
 def test_what_cannot_be_asked():
     camera = camera_at(np.eye(4))
     with pytest.raises(UserError, match="nobody has said where the camera stands: find its pose with"):
-        by_plane(detections(np.ones((1, 4)), ["cube"]), camera.replace(posed=False), SOLIDS)
+        by_plane(detections(np.ones((1, 4)), ["cube"]), camera.replace(has_extrinsics=False), SOLIDS)
     for pixels in (0, -1, np.nan, np.inf):
         with pytest.raises(UserError, match="a number of pixels above zero"):
             by_plane(detections(np.ones((1, 4)), ["cube"]), camera, SOLIDS, pixels=pixels)

@@ -186,4 +186,4 @@ def test_three_views_and_every_reason():
     with pytest.raises(UserError, match="must be said for three cameras and more"):
         by_views(views, cameras, SOLIDS)
     with pytest.raises(UserError, match="nobody has said where the camera stands"):
-        by_views(views[:2], [cameras[0], cameras[1].replace(posed=False)], SOLIDS)
+        by_views(views[:2], [cameras[0], cameras[1].replace(has_extrinsics=False)], SOLIDS)
