@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from arm5dof import __version__
-from arm5dof.cli import targets_csv
-from arm5dof.cli.vision import calibrate as vision
+from arm5dof.cli import targets_csv, vision
 from arm5dof.errors import UserError
 from arm5dof.runtime import files, xla
 

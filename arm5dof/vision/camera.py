@@ -61,6 +61,11 @@ class Camera(struct.PyTreeNode):
                 "calibrate without OpenCV's thin prism and tilted models"
             )
 
+    @property
+    def opencv(self) -> tuple[np.ndarray, np.ndarray]:
+        """`matrix` (3, 3) and `distortion` (4, 5 or 8,), float64, as OpenCV's functions take them."""
+        return np.asarray(self.matrix, float), np.asarray(self.distortion, float)
+
     def with_pose(self, rotation: Array, position: Array) -> Camera:
         """This camera at another place.
 

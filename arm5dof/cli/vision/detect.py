@@ -77,5 +77,5 @@ def _outputs(known: argparse.Namespace, source: Source) -> Iterator[list[Write]]
         if known.json:
             asked.append(stack.enter_context(outputs.json_list(sys.stdout)))
         elif known.out is None:
-            asked.append(stack.enter_context(outputs.table(sys.stdout)))
+            asked.append(stack.enter_context(outputs.detection_table(sys.stdout)))
         yield asked

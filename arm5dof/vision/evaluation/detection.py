@@ -17,7 +17,13 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision.detections import Detections, Detector
 from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
-from arm5dof.vision.evaluation.localization import Accuracy, Tally, edge_errors, look, place
+from arm5dof.vision.evaluation.localization import (
+    Accuracy,
+    Tally,
+    edge_errors,
+    locate_by_each,
+    render_stereo_sample,
+)
 from arm5dof.vision.objects import CLASS_NAMES
 from arm5dof.vision.rendering.simulated import BackEnd
 from arm5dof.vision.synthetic.ground_truth import Truth
@@ -86,16 +92,16 @@ def evaluate(
     pictures: list[np.ndarray] = []
     tallies: dict[str, Tally] = defaultdict(Tally)
     off: list[np.ndarray] = []
-    for done, seen in enumerate(in_order(partial(look, seed=seed, back_end=back_end), scenes), 1):
+    for done, seen in enumerate(in_order(partial(render_stereo_sample, seed=seed, back_end=back_end), scenes), 1):
         first = seen.views[0]
-        both = [unsure(view.picture) for view in seen.views]
+        both = [unsure(view.image) for view in seen.views]
         truths.append(first.truth)
         found.append(both[0])
         sure = [some[some.confidence >= SURE] for some in both]
         off.append(edge_errors(sure[0], first.truth))
-        for method, located in place(seen, sure).items():
+        for method, located in locate_by_each(seen, sure).items():
             tallies[method].add(located, first.truth)
-        pictures += [first.picture] * (done <= TIMED)
+        pictures += [first.image] * (done <= TIMED)
         progress(done)
     positions = {method: tally.accuracy() for method, tally in tallies.items()}
     edge_px = float(np.sqrt(np.mean(np.concatenate(off) ** 2)))

@@ -21,7 +21,7 @@ import numpy as np
 
 from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 from arm5dof.vision.detectors.yolov5.layers import Conv
-from arm5dof.vision.evaluation.localization import pairs
+from arm5dof.vision.evaluation.localization import match_truth
 from arm5dof.vision.rendering import opengl as gl
 from arm5dof.vision.rendering.software import SoftwareRenderer
 from arm5dof.vision.synthetic.samples import shoot
@@ -108,7 +108,7 @@ def _tabletop() -> Finding:
     there = found = 0
     for shot in shots:
         there += int(shot.truth.counts.sum())
-        found += len(pairs(detector(shot.picture), shot.truth)[0])
+        found += len(match_truth(detector(shot.picture), shot.truth)[0])
     ms = _milliseconds(lambda: detector(shots[0].picture))
     detail = f"found {found} of {there} things in {SCENES} simulated pictures, {ms:.1f} ms a picture of 640 x 480"
     works = 2 * found > there

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from helpers.onnx_bytes import NAMES, SIZE, constant, output
 from helpers.pickles import Shell, save
+from helpers.videos import RATE, greys, read_video, write_video
 from helpers.yolov5_bytes import Architecture
 
 from arm5dof.cli import main as cli
@@ -28,7 +29,6 @@ from arm5dof.vision.io.sinks import folder
 from arm5dof.vision.io.sources import Frame, Source, open_source
 from arm5dof.vision.objects import CLASS_NAMES
 
-RATE = 12.5
 BALL = {"class_name": "ball", "class_id": 1, "confidence": 0.9, "xyxy": [12, 16, 28, 40]}
 """What the network of `model` finds in every image of 64 x 64."""
 
@@ -41,27 +41,6 @@ def command(*arguments):
 def model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "ball.onnx"
     return constant(path, output("yolov8"), (1, 3, SIZE, SIZE), {"names": str(list(NAMES))})
-
-
-def write_video(path, pictures, code="mp4v"):
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), RATE, pictures[0].shape[1::-1])
-    for picture in pictures:
-        writer.write(picture[..., ::-1])
-    writer.release()
-    return path
-
-
-def read_video(path):
-    """Frames, RGB, and their number in a second."""
-    capture, frames = cv2.VideoCapture(str(path)), []
-    while (read := capture.read())[0]:
-        frames.append(read[1][..., ::-1])
-    return frames, capture.get(cv2.CAP_PROP_FPS)
-
-
-def greys(n):
-    """Frames that get lighter."""
-    return [np.full((SIZE, SIZE, 3), 20 + 200 * i // n, np.uint8) for i in range(n)]
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import tabletop
-from vision.localization.test_locate import detections
+from helpers.tabletop import detections
 
 from arm5dof.cli import main as cli
 from arm5dof.vision.camera import Camera
@@ -59,25 +59,25 @@ def told(capsys, *words):
 def test_for_programs(folder, capsys):
     middles = np.load(folder / "middles.npy")
     (frame,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS)
-    assert frame["name"] is None and [thing["class_name"] for thing in frame["things"]] == ["cube", "ball", "can"]
-    cube, ball, can = frame["things"]
-    for thing, middle in zip((cube, ball), middles, strict=False):
-        np.testing.assert_allclose(thing["position"], middle, atol=2e-3)
-        assert thing["reason"] is None and (np.linalg.eigvalsh(thing["covariance"]) > 0).all()
+    assert frame["name"] is None and [each["class_name"] for each in frame["objects"]] == ["cube", "ball", "can"]
+    cube, ball, can = frame["objects"]
+    for each, middle in zip((cube, ball), middles, strict=False):
+        np.testing.assert_allclose(each["position"], middle, atol=2e-3)
+        assert each["reason"] is None and (np.linalg.eigvalsh(each["covariance"]) > 0).all()
     assert can == {**can, "position": None, "covariance": None, "reason": "no height is known of can"}
 
     first, second = told(capsys, folder / "frames.json", "--camera", folder / "posed.yml", *HEIGHTS)
-    assert first == {"name": "a.jpg", "things": frame["things"]} and second == {"name": "b.jpg", "things": []}
+    assert first == {"name": "a.jpg", "objects": frame["objects"]} and second == {"name": "b.jpg", "objects": []}
     seen = ["--depth", folder / "depth.png"]
     (by_depth,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, *seen)
-    np.testing.assert_allclose(by_depth["things"][1]["position"], middles[1], atol=2e-3)
+    np.testing.assert_allclose(by_depth["objects"][1]["position"], middles[1], atol=2e-3)
     (near,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--reach", "0", "0.01")
-    assert near["things"][0]["reason"] == "outside the workspace"
-    (rough,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--pixels", "20")
-    assert np.trace(rough["things"][0]["covariance"]) > 50 * np.trace(cube["covariance"])
+    assert near["objects"][0]["reason"] == "outside the workspace"
+    (rough,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--box-std", "20")
+    assert np.trace(rough["objects"][0]["covariance"]) > 50 * np.trace(cube["covariance"])
     # The hand at the base: the camera is where it was.
     words = ["--camera", folder / "on_hand.yml", "--hand", 0, 0, 0, 1, 0, 0, 0]
-    assert told(capsys, folder / "list.json", *words, *HEIGHTS)[0]["things"][0] == cube
+    assert told(capsys, folder / "list.json", *words, *HEIGHTS)[0]["objects"][0] == cube
 
 
 def test_two_cameras(folder, tmp_path, capsys):
@@ -93,7 +93,7 @@ def test_two_cameras(folder, tmp_path, capsys):
         files += [tmp_path / f"{name}.json"]
         words += ["--camera", tmp_path / f"{name}.yml"]
     (frame,) = told(capsys, *files, *words, "--table", "0.5")
-    cube, ball, can = frame["things"]
+    cube, ball, can = frame["objects"]
     np.testing.assert_allclose([cube["position"], ball["position"]], middles[:2], atol=2e-3)
     assert can["position"] is None and can["reason"] == "the other picture shows no can there"
 
@@ -117,12 +117,12 @@ def test_a_simulated_picture_becomes_places(tmp_path, capsys, monkeypatch):
         for more in ([], ["--depth", tmp_path / f"{seed}.png"]):
             monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps([frame])))
             (said,) = told(capsys, "-", "--camera", tmp_path / f"{seed}.yml", *more)
-            assert said["name"] == f"scene {seed}" and len(said["things"]) == len(found)
-            for thing, name, place in zip(said["things"], found.data["class_name"], there.position[whole], strict=True):
-                assert thing["class_name"] == name
-                assert thing["reason"] in (None, "the picture's edge cuts it off")
-                if thing["position"]:
-                    errors.append(np.linalg.norm(np.subtract(thing["position"], place)))
+            assert said["name"] == f"scene {seed}" and len(said["objects"]) == len(found)
+            for each, name, place in zip(said["objects"], found.data["class_name"], there.position[whole], strict=True):
+                assert each["class_name"] == name
+                assert each["reason"] in (None, "the picture's edge cuts it off")
+                if each["position"]:
+                    errors.append(np.linalg.norm(np.subtract(each["position"], place)))
     assert len(errors) > 30 and np.median(errors) < 6e-4 and np.max(errors) < 2.5e-3
 
 
@@ -136,11 +136,11 @@ def test_a_photograph_becomes_places(test_data, tmp_path, capsys):
     matrix = np.array([[900, 0, 405], [0, 900, 540], [0, 0, 1.0]])
     Camera(matrix, np.zeros(5), level @ down, np.array([0, 0, 1.7]), 810, 1080).save(tmp_path / "camera.yml")
     (frame,) = told(
-        capsys, tmp_path / "found.json", "--camera", tmp_path / "camera.yml", "--height", "person=0.86", "--pixels", 10
+        capsys, tmp_path / "found.json", "--camera", tmp_path / "camera.yml", "--height", "person=0.86", "--box-std", 10
     )
-    reasons = [(thing["class_name"], thing["reason"]) for thing in frame["things"]]
+    reasons = [(each["class_name"], each["reason"]) for each in frame["objects"]]
     assert ("bus", "no height is known of bus") in reasons and len(reasons) == 4
-    people = [thing["position"] for thing in frame["things"] if thing["position"]]
+    people = [each["position"] for each in frame["objects"] if each["position"]]
     # Two who wait at about the same distance, on the left; the third is cut off.
     assert len(people) == 2 and all(2 < x < 5 and 0 < y < 2 and abs(z - 0.86) < 1e-3 for x, y, z in people)
 
@@ -176,14 +176,14 @@ def test_bad_input_is_one_line(folder, tmp_path, capfd):
         err = capfd.readouterr().err
         assert err.startswith("arm5dof: ") and "holds no detections: give the JSON" in err and err.count("\n") == 1
     for changes, expected in [
-        ({"camera": folder / "unposed.yml"}, "nobody has said where the camera stands"),
-        ({"camera": folder / "on_hand.yml"}, "nobody has said where the camera stands"),
+        ({"camera": folder / "unposed.yml"}, "the camera has no extrinsics"),
+        ({"camera": folder / "on_hand.yml"}, "the camera has no extrinsics"),
         ({"camera": folder / "list.json"}, "no camera"),
         ({"height": "cube"}, "is no NAME=METRES"),
         ({"height": "cube=x"}, "is no NAME=METRES"),
         ({"height": "cube=0"}, "give metres above zero"),
         ({"height": "cube=0.01:pea"}, "no form 'pea': choose from block, ball, cone"),
-        ({"pixels": 0}, "a number of pixels above zero"),
+        ({"box-std": 0}, "a number of pixels above zero"),
         ({"table": "nan"}, "--table"),
         ({"reach": [0.3, 0.1]}, "--reach takes the smallest distance and the largest"),
         ({"hand": [0, 0, 0, 1, 0, 0, 0]}, "has no hand_rotation"),

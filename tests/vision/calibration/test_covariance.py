@@ -6,8 +6,8 @@ from helpers.tabletop import HEIGHT, LENS, WIDTH, over_the_table, pose
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from arm5dof.vision.calibration import covariance as uncertainty
 from arm5dof.vision.calibration.boards import Checkerboard
+from arm5dof.vision.calibration.covariance import add_pose, placement_covariance
 from arm5dof.vision.calibration.intrinsics import calibrate, find_views
 from arm5dof.vision.camera import Camera
 
@@ -50,7 +50,7 @@ def test_a_board_out_of_place_takes_the_camera_with_it():
     rng = np.random.default_rng(1)
     camera = over_the_table(rng)
     seen = np.linalg.inv(camera) @ tabletop.BOARD_TO_BASE
-    expected = uncertainty.carried((1e-3, 5e-3), seen)
+    expected = placement_covariance((1e-3, 5e-3), seen)
     errors = []
     for _ in range(4000):
         turn = Rotation.from_rotvec(5e-3 * rng.normal(size=3)).as_matrix()
@@ -64,5 +64,5 @@ def test_a_board_out_of_place_takes_the_camera_with_it():
 
 def test_a_camera_of_which_nothing_is_known_stays_one():
     camera = Camera(*LENS, np.eye(3), np.zeros(3), WIDTH, HEIGHT, has_extrinsics=False)
-    posed = uncertainty.with_pose(camera, lambda c: pose(np.eye(3), [0, 0, 1]), np.eye(6))
+    posed = add_pose(camera, lambda c: pose(np.eye(3), [0, 0, 1]), np.eye(6))
     assert posed.has_extrinsics and posed.covariance is None and posed.position[2] == 1

@@ -1,21 +1,29 @@
-"""Points and things seen by several cameras, against OpenCV's triangulation, scipy's least squares and MuJoCo."""
+"""Points and objects seen by several cameras, against OpenCV's triangulation, scipy's least squares and MuJoCo."""
 
 import cv2
 import jax
 import numpy as np
 import pytest
 from helpers import tabletop
-from helpers.tabletop import LENS, SOLIDS, camera_at, over_the_table
+from helpers.tabletop import (
+    LENS,
+    NAMES,
+    SOLIDS,
+    camera_at,
+    detections,
+    ideal_boxes,
+    on_the_table,
+    over_the_table,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import chi2
-from vision.localization.test_locate import NAMES, detections, ideal_boxes, on_the_table
 
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.localization.multi_view import by_views, match, triangulate
+from arm5dof.vision.localization.multi_view import by_views, match_views, triangulate
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -79,8 +87,8 @@ def test_what_is_projected_is_located_wherever_it_is(seed):
         cameras = [camera_at(pose) for pose in apart(rng)]
         views = [detections(ideal_boxes(c, middles, rng.uniform(0.01, 0.03, (8, 2)), names), names) for c in cameras]
         found = by_views(views, cameras, SOLIDS, np.stack([np.arange(8)] * 2, 1))
-    assert all(reason in ("", "the picture's edge cuts it off") for reason in found.reasons)
-    seen = np.array([not reason for reason in found.reasons])
+    assert all(reason in ("", "the picture's edge cuts it off") for reason in found.failure)
+    seen = np.array([not reason for reason in found.failure])
     np.testing.assert_allclose(found.position[seen], middles[seen], atol=2e-6)
 
 
@@ -93,9 +101,9 @@ def test_what_mujoco_renders_is_located():
         cameras = [Camera.from_mujoco(model, name, tabletop.WIDTH, tabletop.HEIGHT) for name in "01"]
         views = [detections(tabletop.boxes(model, tabletop.cast(model, data, c)[0], 4), names) for c in cameras]
         rows = np.stack([np.arange(4)] * 2, 1)
-        np.testing.assert_array_equal(match(tuple(views), tuple(cameras), limit=20), rows)
+        np.testing.assert_array_equal(match_views(tuple(views), tuple(cameras), limit=20), rows)
         found = by_views(views, cameras, SOLIDS)
-        assert not any(found.reasons)
+        assert not any(found.failure)
         points, _ = triangulate(tuple(cameras), np.stack([view.centre for view in views], 1))
         cones += [name in ("cone", "pyramid") for name in names]
         errors += [*np.linalg.norm(found.position - middles, axis=1)]
@@ -118,7 +126,7 @@ def test_the_stated_covariance_is_that_of_the_errors():
             boxes = ideal_boxes(true, middles, rng.uniform(0.012, 0.025, (8, 2)), names, middles[:, 2])
             views.append(detections(boxes + rng.normal(size=(8, 4)), names))
         found = by_views(views, [camera for _, camera in pairs], SOLIDS, np.stack([np.arange(8)] * 2, 1))
-        for i in np.flatnonzero([not reason for reason in found.reasons]):
+        for i in np.flatnonzero([not reason for reason in found.failure]):
             error = found.position[i] - middles[i]
             distance.append(error @ np.linalg.solve(found.covariance[i], error))
             errors.append(1e3 * np.linalg.norm(error))
@@ -140,7 +148,7 @@ def test_boxes_are_matched_by_class_and_by_lines_of_sight():
         detections(ideal_boxes(c, middles, np.full((6, 2), 0.015), names)[order], [names[i] for i in order])
         for c, order in zip(cameras, orders, strict=True)
     )
-    rows = match(views, cameras)
+    rows = match_views(views, cameras)
     pairs = {(int(orders[0][i]), int(orders[1][j])) for i, j in rows}
     assert pairs == {(int(i), int(i)) for i in orders[1]}
     found = by_views(views, cameras, SOLIDS)
@@ -148,11 +156,11 @@ def test_boxes_are_matched_by_class_and_by_lines_of_sight():
     np.testing.assert_allclose(found.position[seen], middles[orders[0]][seen], atol=1e-4)
     assert np.isnan(found.position[~seen]).all() and np.isnan(found.covariance[~seen]).all()
     alone = f"the other picture shows no {names[orders[0][~seen][0]]} there"
-    assert found.detections is views[0] and list(found.reasons) == ["" if both else alone for both in seen]
+    assert found.detections is views[0] and list(found.failure) == ["" if both else alone for both in seen]
     nothing = Detections(np.zeros((0, 4)), [], [], NAMES)
-    assert match((views[0], nothing), cameras).shape == (0, 2)
+    assert match_views((views[0], nothing), cameras).shape == (0, 2)
     assert by_views((nothing, nothing), cameras, SOLIDS).position.shape == (0, 3)
-    assert all(by_views((views[0], nothing), cameras, SOLIDS).reasons)
+    assert all(by_views((views[0], nothing), cameras, SOLIDS).failure)
 
 
 def test_three_views_and_every_reason():
@@ -168,7 +176,7 @@ def test_three_views_and_every_reason():
     assert (np.trace(three.covariance, axis1=1, axis2=2) < np.trace(two.covariance, axis1=1, axis2=2)).all()
 
     def reasons(views, cameras, rows, **options):
-        return list(by_views(views, cameras, SOLIDS, np.array(rows), **options).reasons)
+        return list(by_views(views, cameras, SOLIDS, np.array(rows), **options).failure)
 
     mixed = "no one cube explains its boxes"
     assert reasons(views[:2], cameras[:2], [[0, 3], [1, 1], [3, 2]]) == [mixed, "", mixed]
@@ -179,11 +187,11 @@ def test_three_views_and_every_reason():
     edge = Detections([[0, 100, 30, 130]], [0.9], [NAMES.index("cube")], NAMES)
     assert reasons([views[0], edge], cameras[:2], [[0, 0]]) == ["the picture's edge cuts it off"]
     part = by_views(views[:2], cameras[:2], {"cube": 0.015}, rows[:, :2])
-    assert part.reasons == ("", "no height is known of can", "no height is known of ball", "")
+    assert part.failure == ("", "no height is known of can", "no height is known of ball", "")
 
     with pytest.raises(UserError, match="give two or more of each"):
         by_views(views[:1], cameras[:1], SOLIDS)
     with pytest.raises(UserError, match="must be said for three cameras and more"):
         by_views(views, cameras, SOLIDS)
-    with pytest.raises(UserError, match="nobody has said where the camera stands"):
+    with pytest.raises(UserError, match="the camera has no extrinsics"):
         by_views(views[:2], [cameras[0], cameras[1].replace(has_extrinsics=False)], SOLIDS)
