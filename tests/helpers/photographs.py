@@ -45,14 +45,14 @@ def photograph(drawing, metres_per_pixel, origin, pose):
     return cv2.resize(image, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
 
 
-def poses(rng, n, middle, distance=0.5):
+def poses(rng, n, center, distance=0.5):
     """Board poses (4, 4) in front of the camera, tilted by up to 40 degrees."""
     for _ in range(n):
         turn, _ = cv2.Rodrigues(np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1)]))
         pose = np.eye(4)
         pose[:3, :3] = turn
         at = np.array([*rng.uniform(-0.06, 0.06, 2), distance * rng.uniform(0.9, 1.3)])
-        pose[:3, 3] = at - turn @ [*middle, 0]
+        pose[:3, 3] = at - turn @ [*center, 0]
         yield pose
 
 

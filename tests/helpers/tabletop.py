@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from arm5dof.vision.calibration.boards import Checkerboard, Corners
 from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
 from arm5dof.vision.calibration.extrinsics import from_corners
-from arm5dof.vision.calibration.intrinsics import BoardView, board_pose, fit
+from arm5dof.vision.calibration.intrinsics import fit
+from arm5dof.vision.calibration.views import BoardView, board_pose
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections
 from arm5dof.vision.localization.solids import FORMS, Solid, solid_box
@@ -31,7 +32,7 @@ def pose(rotation, position):
 
 
 def over_the_table(rng, low=35, high=85):
-    """A camera's pose (4, 4), 0.6 to 0.9 m from the middle of the table, so many degrees above it, a little rolled."""
+    """A camera's pose (4, 4), 0.6 to 0.9 m from the center of the table, so many degrees above it, a little rolled."""
     height, around = np.deg2rad(rng.uniform(low, high)), rng.uniform(0, 2 * np.pi)
     away = np.array([np.cos(height) * np.cos(around), np.cos(height) * np.sin(around), np.sin(height)])
     x = np.cross(-away, [0, 0, 1])
@@ -96,16 +97,16 @@ def numbers(array):
 
 
 def table(rng, names, camera_poses):
-    """Objects standing on a table, turned at random, and cameras: MuJoCo's model and data, and the middles (n, 3)."""
+    """Objects standing on a table, turned at random, and cameras: MuJoCo's model and data, and the centers (n, 3)."""
     places: list[np.ndarray] = []
     while len(places) < len(names):
         place = np.array([rng.uniform(0.04, 0.28), rng.uniform(-0.14, 0.14)])
         if all(np.linalg.norm(place - other) > 0.1 for other in places):
             places.append(place)
-    middles = np.array([[*place, SOLIDS[name].half_height] for place, name in zip(places, names, strict=True)])
+    centers = np.array([[*place, SOLIDS[name].half_height] for place, name in zip(places, names, strict=True)])
     bodies = "".join(
-        f'<body pos="{numbers(middle)}" euler="0 0 {rng.uniform(0, 360)}"><geom name="{i}" {OBJECTS[name][0]}/></body>'
-        for i, (middle, name) in enumerate(zip(middles, names, strict=True))
+        f'<body pos="{numbers(center)}" euler="0 0 {rng.uniform(0, 360)}"><geom name="{i}" {OBJECTS[name][0]}/></body>'
+        for i, (center, name) in enumerate(zip(centers, names, strict=True))
     )
     cameras = "".join(
         f'<camera name="{i}" pos="{numbers(m[:3, 3])}" xyaxes="{numbers([m[:3, 0], -m[:3, 1]])}" fovy="48.5"/>'
@@ -118,7 +119,7 @@ def table(rng, names, camera_poses):
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    return model, data, middles
+    return model, data, centers
 
 
 def cast(model, data, camera):
@@ -156,12 +157,12 @@ def detections(boxes, names):
 many_boxes = jax.jit(jax.vmap(solid_box, (None, 0, 0, 0, 0)))
 
 
-def ideal_boxes(camera, middles, radii, names, half_heights=None):
+def ideal_boxes(camera, centers, radii, names, half_heights=None):
     """The boxes (n, 4) of solids of known width."""
     if half_heights is None:
         half_heights = [SOLIDS[name].half_height for name in names]
     forms = np.array([FORMS[SOLIDS[name].form] for name in names])
-    return np.asarray(many_boxes(camera, middles, radii, np.array(half_heights), forms))
+    return np.asarray(many_boxes(camera, centers, radii, np.array(half_heights), forms))
 
 
 def on_the_table(rng, names):

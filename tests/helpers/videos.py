@@ -1,4 +1,4 @@
-"""Short videos."""
+"""Video files written and read with OpenCV."""
 
 import cv2
 import numpy as np

@@ -25,7 +25,7 @@ def float64():
 
 
 def random_camera(rng, coefficients):
-    """Distortion such as lenses have: the corners of the picture move by up to some 60 pixels."""
+    """Distortion such as lenses have: the corners of the image move by up to some 60 pixels."""
     scale = np.array([0.25, 0.08, 2e-3, 2e-3, 0.03, 0.1, 0.03, 0.01])[:coefficients]
     focal = rng.uniform(450, 900)
     rotation, _ = cv2.Rodrigues(rng.uniform(-2, 2, 3))
@@ -40,7 +40,7 @@ def random_camera(rng, coefficients):
 
 
 def points_in_view(rng, camera, n=50):
-    """Points (n, 3) of the base frame, 0.1 to 3 m deep, that an undistorted picture would show."""
+    """Points (n, 3) of the base frame, 0.1 to 3 m deep, that an undistorted image would show."""
     depth = rng.uniform(0.1, 3, n)
     ideal = np.c_[rng.uniform(0, WIDTH, n), rng.uniform(0, HEIGHT, n), np.ones(n)]
     return depth[:, None] * (ideal @ np.linalg.inv(camera.matrix).T) @ camera.rotation.T + camera.position, depth
@@ -123,7 +123,7 @@ def test_what_cannot_be_seen_is_nan():
     front = np.array(camera.position + camera.rotation[:, 2])
     gradient = jax.grad(lambda p: jnp.nansum(camera.project(p)))(np.stack([front, behind]))
     assert np.isfinite(gradient).all() and gradient[0].any()
-    # k1 = -0.3 alone reaches no further than 0.70 from the middle of the image plane at depth 1.
+    # k1 = -0.3 alone reaches no further than 0.70 from the center of the image plane at depth 1.
     barrel = camera.replace(distortion=np.array([-0.3, 0, 0, 0]))
     focal, center = camera.matrix[0, 0], camera.matrix[:2, 2]
     assert np.isfinite(barrel.rays(center + np.array([0.69 * focal, 0]))).all()
@@ -173,7 +173,7 @@ SCENE = """
 def test_mujoco_rays_hit_the_geom_whose_center_is_projected(name):
     """Small balls at random pixels and depths: MuJoCo's ray through each ball's pixel meets that ball, at its depth.
 
-    Which pixels is settled by MuJoCo's own frustum: half the picture's height is tan(fovy / 2) at depth 1."""
+    Which pixels is settled by MuJoCo's own frustum: half the image's height is tan(fovy / 2) at depth 1."""
     rng = np.random.default_rng(4)
     spec = mujoco.MjSpec.from_string(SCENE)
     bare = spec.compile()

@@ -12,7 +12,8 @@ from arm5dof.cli.vision import options
 from arm5dof.runtime import files
 
 if TYPE_CHECKING:
-    from arm5dof.vision.calibration.intrinsics import BoardViews, Calibration
+    from arm5dof.vision.calibration.intrinsics import Calibration
+    from arm5dof.vision.calibration.views import BoardViews
 
 HELP = """\
 Calibrate a camera from photographs of a board.
@@ -61,7 +62,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         options.writable(args.preview, (".png", ".jpg"))
 
     from arm5dof.runtime.progress import late_bar
-    from arm5dof.vision.calibration.intrinsics import calibrate, find_views, image_names, preview
+    from arm5dof.vision.calibration.intrinsics import calibrate, preview
+    from arm5dof.vision.calibration.views import find_views, image_names
     from arm5dof.vision.io.sources import image_files
 
     paths = image_files(args.images)

@@ -13,7 +13,7 @@ from arm5dof.vision.calibration import hand_eye
 from arm5dof.vision.calibration.boards import Board, Corners
 from arm5dof.vision.calibration.covariance import add_pose, placement_covariance, pose_covariance
 from arm5dof.vision.calibration.hand_eye import HandEye
-from arm5dof.vision.calibration.intrinsics import board_error, board_pose, image_names, read_gray
+from arm5dof.vision.calibration.views import board_error, board_pose, image_names, read_gray
 from arm5dof.vision.camera import Camera
 
 MAX_ERROR = 2.0

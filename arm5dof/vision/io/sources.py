@@ -35,7 +35,7 @@ TEXT_CODEC = cv2.VideoWriter.fourcc(*"ansi")
 
 MAX_MISSING_S = 0.5
 """What may be missing at a video's end. What it states of its length is an estimate in some formats, and its sound may
-be a little longer than its pictures."""
+be a little longer than its images."""
 
 
 @dataclass(frozen=True, eq=False)

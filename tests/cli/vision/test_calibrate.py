@@ -15,15 +15,15 @@ def command(*arguments):
 
 
 def test_the_command_writes_a_camera_and_tells_how_well_it_is_known(photographs, tmp_path, capsys):
-    out, picture = tmp_path / "camera.yml", tmp_path / "straight.png"
-    words = [photographs[0].parent, "--board", "9x6", "--square", 0.025, "--out", out, "--preview", picture]
+    out, image = tmp_path / "camera.yml", tmp_path / "straight.png"
+    words = [photographs[0].parent, "--board", "9x6", "--square", 0.025, "--out", out, "--preview", image]
     assert command(*words) == 0
     said = capsys.readouterr().out
     assert all(path.name in said for path in photographs)
     assert "fx          532.90 +- 0.41 pixels" in said and "error 0.185 pixels RMS" in said
     camera = Camera.load(out)
     assert abs(camera.matrix[0, 0] - 532.3) <= 1 and not camera.has_extrinsics
-    assert picture.read_bytes().startswith(b"\x89PNG") and {out, picture} == set(tmp_path.iterdir())
+    assert image.read_bytes().startswith(b"\x89PNG") and {out, image} == set(tmp_path.iterdir())
 
     assert command(*photographs, *words[1:5], "--out", tmp_path / "again.yml", "--json") == 0
     found = json.loads(capsys.readouterr().out)

@@ -353,7 +353,7 @@ def test_a_full_disk_leaves_nothing(model, tmp_path):
 CAMERA = """
 import sys
 import cv2
-from arm5dof import cli, progress
+from arm5dof.cli import main as cli
 
 opened, video = cv2.VideoCapture, sys.argv.pop(1)
 cv2.VideoCapture = lambda what, *more: opened(video) if what == 0 else opened(what, *more)

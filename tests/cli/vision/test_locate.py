@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
     """A posed camera, detections in both formats, and a depth image of what it sees."""
     folder, rng = tmp_path_factory.mktemp("locate"), np.random.default_rng(0)
     names = ["cube", "ball", "can"]
-    model, data, middles = tabletop.table(rng, names, [tabletop.over_the_table(rng)])
+    model, data, centers = tabletop.table(rng, names, [tabletop.over_the_table(rng)])
     camera = Camera.from_mujoco(model, "0", tabletop.WIDTH, tabletop.HEIGHT)
     camera = camera.replace(covariance=np.diag(np.square([*[0.5] * 4, *[1e-3] * 5, *[1e-3] * 6])))
     ids, depth = tabletop.cast(model, data, camera)
@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
     (folder / "frames.json").write_text(json.dumps([frame, {**frame, "name": "b.jpg", "detections": []}]))
     (folder / "other.json").write_text(json.dumps([{**frame, "image_size": [320, 240]}]))
     cv2.imwrite(str(folder / "depth.png"), np.round(1000 * depth).astype(np.uint16))
-    np.save(folder / "middles.npy", middles)
+    np.save(folder / "centers.npy", centers)
     return folder
 
 
@@ -57,12 +57,12 @@ def told(capsys, *words):
 
 
 def test_for_programs(folder, capsys):
-    middles = np.load(folder / "middles.npy")
+    centers = np.load(folder / "centers.npy")
     (frame,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS)
     assert frame["name"] is None and [each["class_name"] for each in frame["objects"]] == ["cube", "ball", "can"]
     cube, ball, can = frame["objects"]
-    for each, middle in zip((cube, ball), middles, strict=False):
-        np.testing.assert_allclose(each["position"], middle, atol=2e-3)
+    for each, center in zip((cube, ball), centers, strict=False):
+        np.testing.assert_allclose(each["position"], center, atol=2e-3)
         assert each["reason"] is None and (np.linalg.eigvalsh(each["covariance"]) > 0).all()
     assert can == {**can, "position": None, "covariance": None, "reason": "no height is known of can"}
 
@@ -70,7 +70,7 @@ def test_for_programs(folder, capsys):
     assert first == {"name": "a.jpg", "objects": frame["objects"]} and second == {"name": "b.jpg", "objects": []}
     seen = ["--depth", folder / "depth.png"]
     (by_depth,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, *seen)
-    np.testing.assert_allclose(by_depth["objects"][1]["position"], middles[1], atol=2e-3)
+    np.testing.assert_allclose(by_depth["objects"][1]["position"], centers[1], atol=2e-3)
     (near,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--reach", "0", "0.01")
     assert near["objects"][0]["reason"] == "outside the workspace"
     (rough,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--box-std", "20")
@@ -81,9 +81,9 @@ def test_for_programs(folder, capsys):
 
 
 def test_two_cameras(folder, tmp_path, capsys):
-    """The same things from elsewhere, in the air for all that one knows of the table."""
+    """The same objects from elsewhere, in the air for all that one knows of the table."""
     rng, names = np.random.default_rng(0), ["cube", "ball", "can"]
-    model, data, middles = tabletop.table(rng, names, [tabletop.over_the_table(rng) for _ in range(2)])
+    model, data, centers = tabletop.table(rng, names, [tabletop.over_the_table(rng) for _ in range(2)])
     files, words = [], list(HEIGHTS)
     for name, shown in (("0", names), ("1", names[:2])):
         camera = Camera.from_mujoco(model, name, tabletop.WIDTH, tabletop.HEIGHT)
@@ -94,13 +94,13 @@ def test_two_cameras(folder, tmp_path, capsys):
         words += ["--camera", tmp_path / f"{name}.yml"]
     (frame,) = told(capsys, *files, *words, "--table", "0.5")
     cube, ball, can = frame["objects"]
-    np.testing.assert_allclose([cube["position"], ball["position"]], middles[:2], atol=2e-3)
+    np.testing.assert_allclose([cube["position"], ball["position"]], centers[:2], atol=2e-3)
     assert can["position"] is None and can["reason"] == "the other picture shows no can there"
 
 
-def test_a_simulated_picture_becomes_places(tmp_path, capsys, monkeypatch):
-    """From pixels to metres: the camera's picture of a scene, the boxes of what can be seen in it as a frame that
-    `vision detect` prints, and their places by `vision locate`, which knows what stands on that table. By the picture,
+def test_a_simulated_image_becomes_places(tmp_path, capsys, monkeypatch):
+    """From pixels to metres: the camera's image of a scene, the boxes of what can be seen in it as a frame that
+    `vision detect` prints, and their places by `vision locate`, which knows what stands on that table. By the image,
     and by the depth image."""
     errors = []
     for seed in range(8):
@@ -150,7 +150,7 @@ def test_for_people(folder, capsys):
     captured = capsys.readouterr()
     name, head, cube, _, can, other, nothing = captured.out.splitlines()
     assert (name, other, nothing) == ("a.jpg", "b.jpg", "  nothing") and head.split()[:2] == ["class", "conf"]
-    position = 1e3 * np.load(folder / "middles.npy")[0]
+    position = 1e3 * np.load(folder / "centers.npy")[0]
     label, confidence, *numbers = cube.split()
     assert (label, confidence) == ("cube", "0.90")
     np.testing.assert_allclose([float(n) for n in numbers[:3]], position, atol=2)

@@ -1,4 +1,4 @@
-"""`arm5dof vision locate` on images, videos, cameras and random scenes: pictures in, points out."""
+"""`arm5dof vision locate` on images, videos, cameras and random scenes: images in, points out."""
 
 import json
 
@@ -58,7 +58,7 @@ def small(tmp_path_factory):
 
 
 SMALL_BALL = 0.2 + 0.5 * (20 - 32) / 100, 0.5 * (32 - 28) / 100, 0.02
-"""Where the middle of its box is seen, by similar triangles; the thing is seen from a little aside."""
+"""Where the center of its box is seen, by similar triangles; the object is seen from a little aside."""
 
 
 def errors(objects, there):
@@ -193,7 +193,7 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
         assert captured.err.count("\n") == 1 and not captured.out and sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_picture_of_another_size_leaves_those_before(photo, tmp_path, capfd):
+def test_an_image_of_another_size_leaves_those_before(photo, tmp_path, capfd):
     other = tmp_path / "other.png"
     cv2.imwrite(str(other), np.zeros((240, 320), np.uint8))
     words = ["--camera", photo.with_name("posed.yml"), "--out", tmp_path / "placed"]

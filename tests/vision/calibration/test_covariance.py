@@ -8,7 +8,8 @@ from scipy.stats import chi2
 
 from arm5dof.vision.calibration.boards import Checkerboard
 from arm5dof.vision.calibration.covariance import add_pose, placement_covariance
-from arm5dof.vision.calibration.intrinsics import calibrate, find_views
+from arm5dof.vision.calibration.intrinsics import calibrate
+from arm5dof.vision.calibration.views import find_views
 from arm5dof.vision.camera import Camera
 
 

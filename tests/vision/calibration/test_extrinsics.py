@@ -17,9 +17,9 @@ def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
     pose = next(poses(np.random.default_rng(1), 1, (0.1, 0.06)))
     spin = np.eye(4)
     spin[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    middle = np.eye(4)
-    middle[:2, 3] = 0.1, 0.06
-    pose = pose @ middle @ spin @ np.linalg.inv(middle)
+    center = np.eye(4)
+    center[:2, 3] = 0.1, 0.06
+    pose = pose @ center @ spin @ np.linalg.inv(center)
     path = tmp_path / "board.png"
     cv2.imwrite(str(path), photograph(*draw(board), pose))
     board_to_base = np.array([[0, 1, 0, 0.2], [1, 0, 0, 0.1], [0, 0, -1, 0], [0, 0, 0, 1.0]])

@@ -7,8 +7,9 @@ from helpers.photographs import TRUE, draw, photograph, poses
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration import boards
-from arm5dof.vision.calibration.boards import BoardNotFoundError, Charuco, Checkerboard, Corners
-from arm5dof.vision.calibration.intrinsics import MIN_VIEWS, BoardView, calibrate, find_views, fit, preview
+from arm5dof.vision.calibration.boards import Charuco, Checkerboard, Corners
+from arm5dof.vision.calibration.intrinsics import calibrate, fit, preview
+from arm5dof.vision.calibration.views import BoardView, find_views
 from arm5dof.vision.camera import Camera
 
 BOARD = Checkerboard(9, 6, 0.025)
@@ -37,11 +38,11 @@ def test_opencvs_published_calibration_is_reproduced_with_its_settings(photograp
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.1)
     rough = []
     for path_, view in zip(photographs, views.found, strict=True):
-        grey = cv2.imread(str(path_), cv2.IMREAD_GRAYSCALE)
-        _, pixels = cv2.findChessboardCorners(grey, (9, 6), flags=3)
+        gray = cv2.imread(str(path_), cv2.IMREAD_GRAYSCALE)
+        _, pixels = cv2.findChessboardCorners(gray, (9, 6), flags=3)
         rough.append(
             BoardView(
-                view.name, Corners(BOARD.points, boards.refine(grey, pixels.reshape(-1, 2), window=11, until=until))
+                view.name, Corners(BOARD.points, boards.refine(gray, pixels.reshape(-1, 2), window=11, until=until))
             )
         )
     result = fit(rough, views.size, flags=cv2.CALIB_FIX_ASPECT_RATIO)
@@ -61,9 +62,7 @@ def test_as_many_coefficients_as_asked_for(views, coefficients):
     assert result.rms < 0.19
 
 
-def test_too_few_views_are_refused(photographs, views):
-    with pytest.raises(UserError, match=f"1 of 1 photographs show the 9x6 checkerboard and .* takes {MIN_VIEWS}"):
-        find_views(photographs[:1], BOARD)
+def test_repeated_views_are_refused(views):
     copies = [BoardView(f"copy {i}", views.found[0].corners) for i in range(13)]
     with pytest.raises(UserError, match="only 1 of 13 views differ"):
         calibrate(views._replace(found=copies))
@@ -79,21 +78,13 @@ def test_uncertain_intrinsics_are_refused(views):
         calibrate(views._replace(found=shifted))
 
 
-@pytest.mark.parametrize("size", [(8, 6), (9, 7), (7, 5), (3, 3), (12, 9)])
-def test_another_size_of_board_is_refused_with_the_right_one(size, photographs):
-    """OpenCV finds 8x6 corners in twelve of the photographs of the 9x6 board, and would calibrate with them."""
-    with pytest.raises(BoardNotFoundError, match="show one of 9x6 inner corners") as caught:
-        find_views(photographs[::2], Checkerboard(*size, 0.025))
-    assert caught.value.size == "9x6"
-
-
 @pytest.mark.parametrize("zoom", [0.8, 1.2])
 def test_a_view_from_another_camera_is_named(zoom, photographs, views):
     """The last photograph as a lens of another focal length would have taken it."""
-    grey = cv2.imread(str(photographs[-2]), cv2.IMREAD_GRAYSCALE)
-    middle = np.array([319.5, 239.5])
-    warp = np.c_[zoom * np.eye(2), (1 - zoom) * middle]
-    other = BOARD.find(cv2.warpAffine(grey, warp, (640, 480), borderValue=200))
+    gray = cv2.imread(str(photographs[-2]), cv2.IMREAD_GRAYSCALE)
+    center = np.array([319.5, 239.5])
+    warp = np.c_[zoom * np.eye(2), (1 - zoom) * center]
+    other = BOARD.find(cv2.warpAffine(gray, warp, (640, 480), borderValue=200))
     mixed = [*views.found[:-2], BoardView("other.jpg", other), views.found[-1]]
     result = calibrate(views._replace(found=mixed))
     assert list(result.outliers) == ["other.jpg"] and result.outliers["other.jpg"] > 1
@@ -105,8 +96,8 @@ def test_two_cameras_half_and_half_are_refused(photographs, views):
     """Neither half stands out, and together they fit to 0.7 pixels, with a focal length that is neither's."""
     mixed, warp = list(views.found), np.array([[1.2, 0, -0.2 * 319.5], [0, 1.2, -0.2 * 239.5]])
     for i in (1, 3, 6, 8, 10, 11):
-        grey = cv2.imread(str(photographs[i]), cv2.IMREAD_GRAYSCALE)
-        mixed[i] = BoardView(f"other {i}", BOARD.find(cv2.warpAffine(grey, warp, (640, 480), borderValue=200)))
+        gray = cv2.imread(str(photographs[i]), cv2.IMREAD_GRAYSCALE)
+        mixed[i] = BoardView(f"other {i}", BOARD.find(cv2.warpAffine(gray, warp, (640, 480), borderValue=200)))
     assert fit(mixed, views.size).rms < 0.8
     with pytest.raises(UserError, match=r"the views do not fit one camera: .* times what they are one by one"):
         calibrate(views._replace(found=mixed))
@@ -119,33 +110,6 @@ def test_views_that_contradict_each_other_are_refused(views):
     ]
     with pytest.raises(UserError, match="do not fit the others"):
         calibrate(views._replace(found=stretched))
-
-
-def test_photographs_of_different_sizes_are_named(photographs, tmp_path):
-    small = tmp_path / "small.png"
-    cv2.imwrite(str(small), cv2.resize(cv2.imread(str(photographs[0])), (320, 240)))
-    with pytest.raises(UserError, match=r"most have 640x480 pixels, but not small.png \(320x240\)"):
-        find_views([*photographs[:3], small], BOARD)
-
-
-def test_files_that_are_no_photographs_are_named(photographs, tmp_path):
-    for name, content, said in [
-        ("empty.png", b"", "is empty"),
-        ("words.jpg", b"hello", "no image"),
-        ("half.jpg", photographs[0].read_bytes()[:200], "no image"),
-    ]:
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(UserError, match=f"{name} .*{said}"):
-            find_views([photographs[0], tmp_path / name], BOARD)
-
-
-def test_pictures_without_a_board(tmp_path):
-    paths = []
-    for i in range(6):
-        paths.append(tmp_path / f"{i}.png")
-        cv2.imwrite(str(paths[-1]), np.random.default_rng(i).integers(0, 255, (240, 320), np.uint8))
-    with pytest.raises(UserError, match="0 of 6 photographs show the 9x6 checkerboard; none of them shows any"):
-        find_views(paths, BOARD)
 
 
 @pytest.mark.parametrize("board", [Charuco(8, 6, 0.03, 0.022), Checkerboard(8, 5, 0.03)], ids=str)
@@ -164,39 +128,11 @@ def test_drawn_boards_give_the_camera_they_were_drawn_through(board, tmp_path):
     assert (np.abs(result.intrinsics - true) < 5 * result.deviations + 1e-3).all()
 
 
-@pytest.mark.parametrize("order", [np.s_[:, :], np.s_[::-1], np.s_[:, ::-1], np.s_[::-1, ::-1]], ids=str)
-def test_the_first_corner_is_told_by_the_colours(order, monkeypatch):
-    """In whatever order a detector gives them: the square before the first corner is black, the columns go down."""
-    board = Checkerboard(8, 5, 0.03)
-    picture, metres_per_pixel, origin = draw(board)
-    detect = Checkerboard._detect
-    monkeypatch.setattr(Checkerboard, "_detect", lambda self, grey: detect(self, grey)[order])
-    corners = board.find(picture)
-    np.testing.assert_allclose(corners.pixels, corners.points[:, :2] / metres_per_pixel + origin, atol=0.1)
-
-
-def test_charuco_boards_that_do_not_exist_or_are_another_size():
-    for arguments, said in [
-        ((8, 6, 0.03, 0.03), "do not fit into squares"),
-        ((8, 6, 0.03, 0.02, "DICT_9X9"), "no marker dictionary 'DICT_9X9'"),
-        ((20, 20, 0.03, 0.02, "DICT_4X4_50"), "needs 200 markers"),
-        ((2, 6, 0.03, 0.02), "at least 3x3"),
-    ]:
-        with pytest.raises(UserError, match=said):
-            Charuco(*arguments)
-    with pytest.raises(UserError, match="give the side of a square in metres"):
-        Checkerboard(9, 6, 25)
-    picture, *_ = draw(Charuco(8, 6, 0.03, 0.022))
-    small = Charuco(5, 4, 0.03, 0.022)
-    with pytest.raises(BoardNotFoundError, match="markers 0 to 9 and the photographs show some up to 23"):
-        small.check_inspected([small.inspect(picture, None)], "")
-
-
 def test_the_preview_straightens_lines(photographs, views):
     """Corners of a row, straight on the board, lie on a line in the right half as they do not in the left."""
     camera = calibrate(views).camera
-    picture = cv2.imdecode(np.frombuffer(preview(photographs[0], camera), np.uint8), cv2.IMREAD_COLOR)
-    assert picture.shape == (480, 1280, 3)
+    image = cv2.imdecode(np.frombuffer(preview(photographs[0], camera), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (480, 1280, 3)
 
     def bend(half):
         grid = BOARD.find(cv2.cvtColor(half, cv2.COLOR_BGR2GRAY)).pixels.reshape(6, 9, 2)
@@ -204,5 +140,5 @@ def test_the_preview_straightens_lines(photographs, views):
         normal = (grid[:, -1] - grid[:, 0])[:, ::-1] * [1, -1]
         return np.abs((away * (normal / np.linalg.norm(normal, axis=-1, keepdims=True))[:, None]).sum(-1)).max()
 
-    left, right = (bend(np.ascontiguousarray(half)) for half in np.split(picture, 2, axis=1))
+    left, right = (bend(np.ascontiguousarray(half)) for half in np.split(image, 2, axis=1))
     assert right < 0.5 and 3 * right < left

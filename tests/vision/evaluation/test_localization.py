@@ -75,8 +75,8 @@ def test_boxes_find_objects_of_their_class_that_they_fit_by_half():
     visible = np.array([1, 1, 1, 0.4])
     there = Truth(box, np.array([0, 1, 2, 3]), visible, np.zeros((4, 3)), np.zeros(4))
     given = [[12, 10, 30, 30], [10, 10, 30, 29.5], [50, 10, 70, 30], [10, 50, 18, 70], [50, 50, 70, 70]]
-    things, boxes = match_truth(Detections(given, [0.9, 0.8, 0.7, 0.6, 0.5], [0, 0, 3, 2, 3], CLASS_NAMES), there)
-    assert list(things) == [0] and list(boxes) == [1]
+    objects, boxes = match_truth(Detections(given, [0.9, 0.8, 0.7, 0.6, 0.5], [0, 0, 3, 2, 3], CLASS_NAMES), there)
+    assert list(objects) == [0] and list(boxes) == [1]
     assert [len(rows) for rows in match_truth(Detections([], [], [], CLASS_NAMES), there)] == [0, 0]
 
 

@@ -18,17 +18,17 @@ def test_boxes_surround_the_points_of_a_solid_as_opencv_projects_them(form):
     )
     for coefficients in (4, 5, 8):
         camera = camera_at(over_the_table(rng), random_lens(rng, coefficients))
-        middle, radii, half_height = np.array([0.2, 0.08, 0.02]), np.array([0.015, 0.03]), 0.02
+        center, radii, half_height = np.array([0.2, 0.08, 0.02]), np.array([0.015, 0.03]), 0.02
         x = np.append(camera.rotation[:2, 0], 0) / np.linalg.norm(camera.rotation[:2, 0])
         y = np.array([-x[1], x[0], 0])
         ring = radii[0] * np.cos(angles)[:, None] * x + radii[1] * np.sin(angles)[:, None] * y
-        points = np.concatenate([middle + width * ring + [0, 0, half_height * level] for level, width in levels])
+        points = np.concatenate([center + width * ring + [0, 0, half_height * level] for level, width in levels])
         turn, _ = cv2.Rodrigues(camera.rotation.T)
         pixels, _ = cv2.projectPoints(
             points, turn, -camera.rotation.T @ camera.position, *(camera.matrix, camera.distortion)
         )
         expected = np.concatenate([pixels[:, 0].min(0), pixels[:, 0].max(0)]) + 0.5
-        found = solid_box(camera, middle, radii, half_height, FORMS[form])
+        found = solid_box(camera, center, radii, half_height, FORMS[form])
         np.testing.assert_allclose(found, expected, atol=0.05)
 
 

@@ -32,32 +32,32 @@ def test_what_is_projected_is_located(seed, coefficients):
     """Any camera, and any solid whose box it sees: the way back leads to where it stood."""
     rng = np.random.default_rng(seed)
     names = list(rng.choice(NAMES, 8))
-    middles, radii = on_the_table(rng, names), rng.uniform(0.01, 0.03, (8, 2))
+    centers, radii = on_the_table(rng, names), rng.uniform(0.01, 0.03, (8, 2))
     with jax.enable_x64(True):
         camera = camera_at(over_the_table(rng, 20, 89), random_lens(rng, coefficients))
-        found = by_plane(detections(ideal_boxes(camera, middles, radii, names), names), camera, SOLIDS)
+        found = by_plane(detections(ideal_boxes(camera, centers, radii, names), names), camera, SOLIDS)
     assert all(reason in ("", "the picture's edge cuts it off") for reason in found.failure)
     seen = np.array([not reason for reason in found.failure])
-    np.testing.assert_allclose(found.position[seen], middles[seen], atol=1e-6)
+    np.testing.assert_allclose(found.position[seen], centers[seen], atol=1e-6)
 
 
 def test_what_mujoco_renders_is_located():
-    """Boxes around what MuJoCo's rays hit, whole pixels and no noise. The middle of the box, cast back onto the plane
-    of the middles, is what everybody does; it is further off, and for cones by a centimetre."""
+    """Boxes around what MuJoCo's rays hit, whole pixels and no noise. The center of the box, cast back onto the plane
+    of the centers, is what everybody does; it is further off, and for cones by a centimetre."""
     rng = np.random.default_rng(1)
     errors, plain = {name: [] for name in NAMES}, {name: [] for name in NAMES}
     for _ in range(25):
         names = list(rng.choice(NAMES, 4, replace=False))
-        model, data, middles = tabletop.table(rng, names, [over_the_table(rng, 30, 88)])
+        model, data, centers = tabletop.table(rng, names, [over_the_table(rng, 30, 88)])
         camera = tabletop.Camera.from_mujoco(model, "0", tabletop.WIDTH, tabletop.HEIGHT)
         found = detections(tabletop.boxes(model, tabletop.cast(model, data, camera)[0], 4), names)
         located = by_plane(found, camera, SOLIDS)
         assert not any(located.failure)
         rays = np.asarray(camera.rays(found.centre))
-        cast = camera.position + rays * ((middles[:, 2] - camera.position[2]) / rays[:, 2])[:, None]
+        cast = camera.position + rays * ((centers[:, 2] - camera.position[2]) / rays[:, 2])[:, None]
         for i, name in enumerate(names):
-            errors[name].append(1e3 * np.linalg.norm(located.position[i] - middles[i]))
-            plain[name].append(1e3 * np.linalg.norm(cast[i] - middles[i]))
+            errors[name].append(1e3 * np.linalg.norm(located.position[i] - centers[i]))
+            plain[name].append(1e3 * np.linalg.norm(cast[i] - centers[i]))
     every, before = np.concatenate(list(errors.values())), np.concatenate(list(plain.values()))
     assert np.median(every) < 0.6 and np.percentile(every, 95) < 1.5
     assert np.median(before) > 1.4 * np.median(every)
@@ -73,12 +73,12 @@ def test_the_stated_covariance_is_that_of_the_errors():
     for _ in range(50):
         true, camera = tabletop.calibrated_and_posed(rng)
         names = list(rng.choice(NAMES, 8))
-        middles, radii = on_the_table(rng, names), rng.uniform(0.012, 0.025, (8, 2))
-        middles[:, 2] += 5e-4 * rng.normal(size=8)
-        boxes = ideal_boxes(true, middles, radii, names, middles[:, 2]) + rng.normal(size=(8, 4))
+        centers, radii = on_the_table(rng, names), rng.uniform(0.012, 0.025, (8, 2))
+        centers[:, 2] += 5e-4 * rng.normal(size=8)
+        boxes = ideal_boxes(true, centers, radii, names, centers[:, 2]) + rng.normal(size=(8, 4))
         found = by_plane(detections(boxes, names), camera, SOLIDS)
         for i in np.flatnonzero([not reason for reason in found.failure]):
-            error = found.position[i] - middles[i]
+            error = found.position[i] - centers[i]
             distance.append(error @ np.linalg.solve(found.covariance[i], error))
             errors.append(1e3 * np.linalg.norm(error))
     assert len(distance) > 350
@@ -126,7 +126,7 @@ def test_the_covariance_is_made_of_derivatives():
 
 
 def test_every_object_without_a_position_has_a_reason():
-    """A camera that looks to the horizon, and boxes all over its picture."""
+    """A camera that looks to the horizon, and boxes all over its image."""
     level = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
     tilted = level @ cv2.Rodrigues(np.array([np.deg2rad(-15), 0, 0]))[0]
     camera = camera_at(tabletop.pose(tilted, [0, 0, 0.4]))
@@ -152,7 +152,7 @@ def test_every_object_without_a_position_has_a_reason():
     first, second, *_ = located.rows()
     assert first["reason"] is None and first["position"] == located.position[0].tolist() and first["confidence"] == 0.9
     assert second["position"] is None and second["covariance"] is None and second["class_name"] == "cup"
-    # k1 = -0.3 alone reaches no further than 0.70 from the middle of the image plane at depth 1.
+    # k1 = -0.3 alone reaches no further than 0.70 from the center of the image plane at depth 1.
     barrel = camera.replace(distortion=np.array([-0.3, 0, 0, 0]), matrix=camera.matrix * [[0.5], [0.5], [1]])
     edge = by_plane(Detections([[600, 400, 630, 430]], [0.9], [0], ("cube",)), barrel, SOLIDS)
     assert edge.failure == ("the lens model shows nothing there",)
@@ -164,18 +164,18 @@ def test_every_object_without_a_position_has_a_reason():
 def test_any_number_of_objects_and_heights_as_plain_numbers():
     rng = np.random.default_rng(4)
     camera, names = camera_at(over_the_table(rng)), ["cube"] * 9
-    middles = on_the_table(rng, names)
-    boxes = ideal_boxes(camera, middles, np.full((9, 2), 0.015), names)
+    centers = on_the_table(rng, names)
+    boxes = ideal_boxes(camera, centers, np.full((9, 2), 0.015), names)
     nine = by_plane(detections(boxes, names), camera, {"cube": 0.015}, table_height=0.0)
-    np.testing.assert_allclose(nine.position, middles, atol=1e-4)
+    np.testing.assert_allclose(nine.position, centers, atol=1e-4)
     one = by_plane(detections(boxes[:1], names[:1]), camera, {"cube": 0.015})
-    np.testing.assert_allclose(one.position, middles[:1], atol=1e-4)
+    np.testing.assert_allclose(one.position, centers[:1], atol=1e-4)
     none = by_plane(detections(np.zeros((0, 4)), []), camera, {"cube": 0.015})
     assert none.position.shape == (0, 3) and none.covariance.shape == (0, 3, 3) and none.failure == ()
     # On a table that is higher, seen by a camera that is as much higher.
     raised = camera.replace(position=camera.position + np.array([0, 0, 0.1]))
     nine = by_plane(detections(boxes, names), raised, {"cube": 0.015}, table_height=0.1)
-    np.testing.assert_allclose(nine.position, middles + np.array([0, 0, 0.1]), atol=1e-4)
+    np.testing.assert_allclose(nine.position, centers + np.array([0, 0, 0.1]), atol=1e-4)
 
 
 def test_what_cannot_be_asked():
