@@ -16,7 +16,7 @@ def test_a_quaternion_is_scipys():
     for numbers in ([0] * 6, [0, 0, 0, 1, 0, 0, np.nan], [0, 0, 0, np.inf, 0, 0, 0]):
         with pytest.raises(UserError, match="a pose is seven numbers"):
             pose_from_quaternion(numbers)
-    with pytest.raises(UserError, match="has length 1, not 1.02"):
+    with pytest.raises(UserError, match=r"has length 1, not 1\.02"):
         pose_from_quaternion([0, 0, 0, 1.02, 0, 0, 0])
 
 
