@@ -32,6 +32,14 @@ def test_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def photographs(test_data: Path) -> list[Path]:
+    """OpenCV's sample: 13 of a board of 9x6 inner corners."""
+    paths = sorted((test_data / "vision/checkerboard").glob("left*.jpg"))
+    assert len(paths) == 13
+    return paths
+
+
+@pytest.fixture(scope="session")
 def arm() -> Arm:
     from arm5dof.arm import load_arm
 

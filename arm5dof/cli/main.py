@@ -10,9 +10,8 @@ import warnings
 from collections.abc import Sequence
 
 from arm5dof import __version__
-from arm5dof.cli import evaluate, solve, train
+from arm5dof.cli import evaluate, solve, train, vision
 from arm5dof.cli.parser import Parser
-from arm5dof.cli.vision import calibrate as vision
 from arm5dof.errors import UserError
 from arm5dof.runtime import xla
 

@@ -4,8 +4,9 @@ import functools
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from arm5dof.vision.calibration.boards import Charuco
+from arm5dof.vision.calibration.boards import Charuco, Checkerboard
 from arm5dof.vision.camera import Camera
 
 TRUE = Camera(
@@ -17,6 +18,10 @@ TRUE = Camera(
     height=480,
 )
 
+KNOWN = TRUE.replace(covariance=np.diag(np.square([0.5, 0.5, 0.5, 0.5, *[1e-3] * 5, *[0] * 6])))
+"""How one knows it."""
+
+BOARD = Checkerboard(8, 5, 0.03)
 
 OVERSAMPLING = 2
 
@@ -36,18 +41,18 @@ def photograph(drawing, metres_per_pixel, origin, pose):
     homography = np.linalg.inv(np.c_[pose[:3, :2], pose[:3, 3]])
     place = rays() @ homography[:, :2].T + homography[:, 2]
     place = (place[..., :2] / place[..., 2:] / metres_per_pixel + origin).astype(np.float32)
-    picture = cv2.remap(drawing, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=200)
-    return cv2.resize(picture, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
+    image = cv2.remap(drawing, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=200)
+    return cv2.resize(image, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
 
 
-def poses(rng, n, middle, distance=0.5):
+def poses(rng, n, center, distance=0.5):
     """Board poses (4, 4) in front of the camera, tilted by up to 40 degrees."""
     for _ in range(n):
         turn, _ = cv2.Rodrigues(np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1)]))
         pose = np.eye(4)
         pose[:3, :3] = turn
         at = np.array([*rng.uniform(-0.06, 0.06, 2), distance * rng.uniform(0.9, 1.3)])
-        pose[:3, 3] = at - turn @ [*middle, 0]
+        pose[:3, 3] = at - turn @ [*center, 0]
         yield pose
 
 
@@ -55,10 +60,47 @@ def draw(board):
     """A drawing, its metres per pixel, and the pixel of the board's origin."""
     scale = 24
     if isinstance(board, Charuco):
-        picture = board.opencv.generateImage((scale * board.columns, scale * board.rows), marginSize=0)
-        return picture, board.square / scale, np.array([scale - 0.5, scale - 0.5])
+        image = board.opencv.generateImage((scale * board.columns, scale * board.rows), marginSize=0)
+        return image, board.square / scale, np.array([scale - 0.5, scale - 0.5])
     squares = np.indices((board.rows + 1, board.columns + 1)).sum(0) % 2 * 255
-    picture = cv2.copyMakeBorder(
+    image = cv2.copyMakeBorder(
         np.kron(squares, np.ones((scale, scale))).astype(np.uint8), *[scale] * 4, cv2.BORDER_CONSTANT, value=255
     )
-    return picture, board.square / scale, np.array([2 * scale - 0.5, 2 * scale - 0.5])
+    return image, board.square / scale, np.array([2 * scale - 0.5, 2 * scale - 0.5])
+
+
+def matrix(rotation, position):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
+
+
+CAMERA = matrix(Rotation.from_euler("xyz", [0.4, -0.3, 1.1]), [0.05, -0.02, 0.04])
+"""On the hand, or beside the arm."""
+
+OTHER = matrix(Rotation.from_euler("xyz", [0.2, 0.1, -0.5]), [0.3, 0.1, 0.02])
+"""The board's pose, where it lies or in the hand."""
+
+
+def photograph_board(folder):
+    """Photographs of a board in a folder, and its poses (4, 4) in the camera's frame; the last shows none."""
+    rng = np.random.default_rng(3)
+    seen = list(poses(rng, 10, (0.1, 0.06)))
+    paths = [folder / f"{i}.png" for i in range(len(seen) + 1)]
+    for path, pose in zip(paths, seen, strict=False):
+        cv2.imwrite(str(path), photograph(*draw(BOARD), pose))
+    cv2.imwrite(str(paths[-1]), np.full((480, 640), 128, np.uint8))
+    return paths, np.array([*seen, seen[0]])
+
+
+def hand_poses(seen, eye_in_hand):
+    """The hand's poses (n, 4, 4) at which the camera sees the board so."""
+    return OTHER @ np.linalg.inv(CAMERA @ seen) if eye_in_hand else CAMERA @ seen @ np.linalg.inv(OTHER)
+
+
+def write_poses(path, arm, names):
+    """A CSV file of the hand's poses (n, 4, 4) and photographs."""
+    turns = np.roll(Rotation.from_matrix(arm[:, :3, :3]).as_quat(), 1, axis=1)
+    rows = [",".join(map(str, [n, *a[:3, 3], *q])) for n, a, q in zip(names, arm, turns, strict=True)]
+    path.write_text("\n".join(["image,x,y,z,qw,qx,qy,qz", *rows]))
+    return path

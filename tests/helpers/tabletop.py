@@ -1,16 +1,20 @@
-"""Cameras over a table, calibrated and posed with noise as real ones are, and MuJoCo's word for what they see."""
+"""Cameras over a table, calibrated and posed with noise as real ones are, and MuJoCo's word for what they see; objects
+on the table, their detections and their boxes."""
 
 import cv2
+import jax
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from arm5dof.vision.calibration import covariance as uncertainty
 from arm5dof.vision.calibration.boards import Checkerboard, Corners
+from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
 from arm5dof.vision.calibration.extrinsics import from_corners
-from arm5dof.vision.calibration.intrinsics import View, board_pose, fit
+from arm5dof.vision.calibration.intrinsics import fit
+from arm5dof.vision.calibration.views import BoardView, board_pose
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.localization.solids import Solid
+from arm5dof.vision.detections import Detections
+from arm5dof.vision.localization.solids import FORMS, Solid, solid_box
 
 WIDTH, HEIGHT = 640, 480
 BOARD = Checkerboard(9, 6, 0.025)
@@ -28,7 +32,7 @@ def pose(rotation, position):
 
 
 def over_the_table(rng, low=35, high=85):
-    """A camera's pose (4, 4), 0.6 to 0.9 m from the middle of the table, so many degrees above it, a little rolled."""
+    """A camera's pose (4, 4), 0.6 to 0.9 m from the center of the table, so many degrees above it, a little rolled."""
     height, around = np.deg2rad(rng.uniform(low, high)), rng.uniform(0, 2 * np.pi)
     away = np.array([np.cos(height) * np.cos(around), np.cos(height) * np.sin(around), np.sin(height)])
     x = np.cross(-away, [0, 0, 1])
@@ -56,9 +60,9 @@ def calibrated(rng):
         board = pose(turn, [*rng.uniform(-0.08, 0.08, 2), rng.uniform(0.35, 0.6)]) @ pose(np.eye(3), [-0.1, -0.0625, 0])
         seen = corners(rng, board)
         if (seen.pixels > 5).all() and (seen.pixels < [WIDTH - 6, HEIGHT - 6]).all():
-            views.append(View(str(len(views)), seen))
+            views.append(BoardView(str(len(views)), seen))
     camera, seen = fit(views, (WIDTH, HEIGHT)).camera, [view.corners for view in views]
-    return uncertainty.with_intrinsics(camera, seen, [board_pose(camera, c) for c in seen])
+    return add_intrinsics_covariance(camera, seen, [board_pose(camera, c) for c in seen])
 
 
 def calibrated_and_posed(rng):
@@ -72,7 +76,7 @@ ROUND = np.linspace(0, 2 * np.pi, 40, endpoint=False)
 CONE = np.vstack([np.c_[0.02 * np.cos(ROUND), 0.02 * np.sin(ROUND), -0.02 + 0 * ROUND], [0, 0, 0.02]])
 PYRAMID = np.array([[0.02 * i, 0.02 * j, -0.02] for i in (-1, 1) for j in (-1, 1)] + [[0, 0, 0.02]])
 
-THINGS = {
+OBJECTS = {
     "cube": ('type="box" size=".015 .015 .015"', Solid(0.015)),
     "brick": ('type="box" size=".03 .015 .015"', Solid(0.015)),
     "tower": ('type="box" size=".01 .01 .03"', Solid(0.03)),
@@ -85,7 +89,7 @@ THINGS = {
 }
 """How MuJoCo makes them, and what is known of them."""
 
-SOLIDS = {name: solid for name, (_, solid) in THINGS.items()}
+SOLIDS = {name: solid for name, (_, solid) in OBJECTS.items()}
 
 
 def numbers(array):
@@ -93,16 +97,16 @@ def numbers(array):
 
 
 def table(rng, names, camera_poses):
-    """Things standing on a table, turned at random, and cameras: MuJoCo's model and data, and the middles (n, 3)."""
+    """Objects standing on a table, turned at random, and cameras: MuJoCo's model and data, and the centers (n, 3)."""
     places: list[np.ndarray] = []
     while len(places) < len(names):
         place = np.array([rng.uniform(0.04, 0.28), rng.uniform(-0.14, 0.14)])
         if all(np.linalg.norm(place - other) > 0.1 for other in places):
             places.append(place)
-    middles = np.array([[*place, SOLIDS[name].half_height] for place, name in zip(places, names, strict=True)])
+    centers = np.array([[*place, SOLIDS[name].half_height] for place, name in zip(places, names, strict=True)])
     bodies = "".join(
-        f'<body pos="{numbers(middle)}" euler="0 0 {rng.uniform(0, 360)}"><geom name="{i}" {THINGS[name][0]}/></body>'
-        for i, (middle, name) in enumerate(zip(middles, names, strict=True))
+        f'<body pos="{numbers(center)}" euler="0 0 {rng.uniform(0, 360)}"><geom name="{i}" {OBJECTS[name][0]}/></body>'
+        for i, (center, name) in enumerate(zip(centers, names, strict=True))
     )
     cameras = "".join(
         f'<camera name="{i}" pos="{numbers(m[:3, 3])}" xyaxes="{numbers([m[:3, 0], -m[:3, 1]])}" fovy="48.5"/>'
@@ -115,7 +119,7 @@ def table(rng, names, camera_poses):
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    return model, data, middles
+    return model, data, centers
 
 
 def cast(model, data, camera):
@@ -133,9 +137,42 @@ def cast(model, data, camera):
 
 
 def boxes(model, ids, count):
-    """The boxes (n, 4) around the things in a segmentation (h, w)."""
+    """The boxes (n, 4) around the objects in a segmentation (h, w)."""
     found = []
     for i in range(count):
         rows, columns = np.nonzero(ids == model.geom(str(i)).id)
         found.append([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
     return np.array(found, float)
+
+
+NAMES = tuple(SOLIDS)
+
+
+def detections(boxes, names):
+    """In the order given: the first is the most confident."""
+    ids = [NAMES.index(name) for name in names]
+    return Detections(boxes, np.linspace(0.9, 0.5, len(ids)), ids, NAMES)
+
+
+many_boxes = jax.jit(jax.vmap(solid_box, (None, 0, 0, 0, 0)))
+
+
+def ideal_boxes(camera, centers, radii, names, half_heights=None):
+    """The boxes (n, 4) of solids of known width."""
+    if half_heights is None:
+        half_heights = [SOLIDS[name].half_height for name in names]
+    forms = np.array([FORMS[SOLIDS[name].form] for name in names])
+    return np.asarray(many_boxes(camera, centers, radii, np.array(half_heights), forms))
+
+
+def on_the_table(rng, names):
+    places = np.c_[rng.uniform(0.05, 0.28, len(names)), rng.uniform(-0.12, 0.12, len(names))]
+    return np.c_[places, [SOLIDS[name].half_height for name in names]]
+
+
+def random_lens(rng, coefficients):
+    """Distortion such as lenses have: the corners of the image move by up to some 60 pixels."""
+    scale = np.array([0.25, 0.08, 2e-3, 2e-3, 0.03, 0.1, 0.03, 0.01])[:coefficients]
+    focal = rng.uniform(450, 700)
+    matrix = np.array([[focal, 0, rng.uniform(300, 340)], [0, focal * rng.uniform(0.95, 1.05), 240], [0, 0, 1]])
+    return matrix, scale * rng.uniform(-1, 1, coefficients)

@@ -25,7 +25,7 @@ def float64():
 
 
 def random_camera(rng, coefficients):
-    """Distortion such as lenses have: the corners of the picture move by up to some 60 pixels."""
+    """Distortion such as lenses have: the corners of the image move by up to some 60 pixels."""
     scale = np.array([0.25, 0.08, 2e-3, 2e-3, 0.03, 0.1, 0.03, 0.01])[:coefficients]
     focal = rng.uniform(450, 900)
     rotation, _ = cv2.Rodrigues(rng.uniform(-2, 2, 3))
@@ -40,7 +40,7 @@ def random_camera(rng, coefficients):
 
 
 def points_in_view(rng, camera, n=50):
-    """Points (n, 3) of the base frame, 0.1 to 3 m deep, that an undistorted picture would show."""
+    """Points (n, 3) of the base frame, 0.1 to 3 m deep, that an undistorted image would show."""
     depth = rng.uniform(0.1, 3, n)
     ideal = np.c_[rng.uniform(0, WIDTH, n), rng.uniform(0, HEIGHT, n), np.ones(n)]
     return depth[:, None] * (ideal @ np.linalg.inv(camera.matrix).T) @ camera.rotation.T + camera.position, depth
@@ -123,22 +123,22 @@ def test_what_cannot_be_seen_is_nan():
     front = np.array(camera.position + camera.rotation[:, 2])
     gradient = jax.grad(lambda p: jnp.nansum(camera.project(p)))(np.stack([front, behind]))
     assert np.isfinite(gradient).all() and gradient[0].any()
-    # k1 = -0.3 alone reaches no further than 0.70 from the middle of the image plane at depth 1.
+    # k1 = -0.3 alone reaches no further than 0.70 from the center of the image plane at depth 1.
     barrel = camera.replace(distortion=np.array([-0.3, 0, 0, 0]))
-    focal, centre = camera.matrix[0, 0], camera.matrix[:2, 2]
-    assert np.isfinite(barrel.rays(centre + np.array([0.69 * focal, 0]))).all()
+    focal, center = camera.matrix[0, 0], camera.matrix[:2, 2]
+    assert np.isfinite(barrel.rays(center + np.array([0.69 * focal, 0]))).all()
     for beyond in (0.71, 1, 1.7, 3):
-        assert np.isnan(barrel.rays(centre + np.array([beyond * focal, 0]))).all()
-        assert np.isnan(barrel.undistort(centre + np.array([beyond * focal, 0]))).all()
+        assert np.isnan(barrel.rays(center + np.array([beyond * focal, 0]))).all()
+        assert np.isnan(barrel.undistort(center + np.array([beyond * focal, 0]))).all()
 
 
 @given(SEEDS, st.sampled_from([4, 5, 8]))
-def test_disturbed_cameras_are_as_opencv_and_scipy_make_them(seed, coefficients):
+def test_perturbed_cameras_are_as_opencv_and_scipy_make_them(seed, coefficients):
     rng = np.random.default_rng(seed)
     camera = random_camera(rng, coefficients)
     lens, turn, shift = rng.normal(size=4), 0.01 * rng.normal(size=3), 0.01 * rng.normal(size=3)
     bent = 0.01 * rng.normal(size=coefficients)
-    other = camera.disturbed(np.concatenate([lens, bent, turn, shift]))
+    other = camera.perturbed(np.concatenate([lens, bent, turn, shift]))
     points, _ = points_in_view(rng, camera)
     matrix = camera.matrix + np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 0]])
     rotation = camera.rotation @ Rotation.from_rotvec(turn).as_matrix()
@@ -170,10 +170,10 @@ SCENE = """
 
 
 @pytest.mark.parametrize("name", ["eye", "hand"])
-def test_mujoco_rays_hit_the_geom_whose_centre_is_projected(name):
+def test_mujoco_rays_hit_the_geom_whose_center_is_projected(name):
     """Small balls at random pixels and depths: MuJoCo's ray through each ball's pixel meets that ball, at its depth.
 
-    Which pixels is settled by MuJoCo's own frustum: half the picture's height is tan(fovy / 2) at depth 1."""
+    Which pixels is settled by MuJoCo's own frustum: half the image's height is tan(fovy / 2) at depth 1."""
     rng = np.random.default_rng(4)
     spec = mujoco.MjSpec.from_string(SCENE)
     bare = spec.compile()
@@ -184,28 +184,28 @@ def test_mujoco_rays_hit_the_geom_whose_centre_is_projected(name):
     half = np.tan(np.deg2rad(bare.camera(name).fovy[0]) / 2)
     right, up = rng.uniform(-1, 1, (2, 40)) * [[WIDTH / HEIGHT], [1]]
     depth = rng.uniform(0.3, 2, 40)
-    centres = place + depth[:, None] * (np.c_[half * right, half * up, -np.ones(40)] @ frame.T)
-    for centre in centres:
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=centre)
+    centers = place + depth[:, None] * (np.c_[half * right, half * up, -np.ones(40)] @ frame.T)
+    for center in centers:
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=center)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[0] = 0.7
     mujoco.mj_forward(model, data)
     camera = Camera.from_mujoco(model, name, WIDTH, HEIGHT, data)
 
-    pixels = np.array(camera.project(centres))
+    pixels = np.array(camera.project(centers))
     expected = np.c_[(WIDTH - 1) / 2 + right * HEIGHT / 2, (HEIGHT - 1) / 2 - up * HEIGHT / 2]
     np.testing.assert_allclose(pixels, expected, atol=1e-8)
     balls = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0]
     assert len(balls) == 40
     hits = 0
-    for ball, ray, centre in zip(balls, np.array(camera.rays(pixels)), centres, strict=True):
+    for ball, ray, center in zip(balls, np.array(camera.rays(pixels)), centers, strict=True):
         hit = np.array([-1], np.int32)
         distance = mujoco.mj_ray(model, data, camera.position, ray, None, 1, -1, hit)
         if hit[0] != ball:  # Something nearer is in the way, and only then.
-            assert 0 < distance < np.linalg.norm(centre - camera.position) - 2e-3
+            assert 0 < distance < np.linalg.norm(center - camera.position) - 2e-3
             continue
-        assert distance == pytest.approx(np.linalg.norm(centre - camera.position) - 1e-3, abs=1e-6)
+        assert distance == pytest.approx(np.linalg.norm(center - camera.position) - 1e-3, abs=1e-6)
         hits += 1
     assert hits > 35
     # Without data the model is at rest, where the camera on the moving body stands elsewhere.
@@ -226,7 +226,7 @@ def test_mujoco_cameras_by_sensor_size_and_by_name():
 
 def test_opencvs_own_file(test_data):
     camera = Camera.load(test_data / "vision/checkerboard/left_intrinsics.yml")
-    assert (camera.width, camera.height, camera.posed) == (640, 480, False)
+    assert (camera.width, camera.height, camera.has_extrinsics) == (640, 480, False)
     assert camera.matrix[0, 0] == 535.91573396163199 and camera.distortion[4] == 0.23839153080878486
     assert (camera.rotation == np.eye(3)).all() and not camera.position.any()
 
@@ -237,13 +237,13 @@ def test_files_lose_nothing(coefficients, tmp_path):
     camera.save(tmp_path / "camera.yml", {"avg_reprojection_error": 0.2, "board": "9x6"})
     again = Camera.load(tmp_path / "camera.yml")
     jax.tree.map(np.testing.assert_array_equal, camera, again)
-    assert again.posed and again.covariance is None
+    assert again.has_extrinsics and again.covariance is None
     storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_READ)
     assert storage.getNode("image_width").real() == WIDTH
     assert (storage.getNode("camera_matrix").mat() == camera.matrix).all()
     assert (storage.getNode("distortion_coefficients").mat().ravel() == camera.distortion).all()
-    camera.replace(posed=False).save(tmp_path / "bare.yml")
-    assert not Camera.load(tmp_path / "bare.yml").posed
+    camera.replace(has_extrinsics=False).save(tmp_path / "bare.yml")
+    assert not Camera.load(tmp_path / "bare.yml").has_extrinsics
 
 
 def test_files_keep_the_covariance_and_the_pose_on_a_hand(tmp_path):
@@ -255,12 +255,12 @@ def test_files_keep_the_covariance_and_the_pose_on_a_hand(tmp_path):
     np.testing.assert_array_equal(Camera.load(tmp_path / "known.yml").covariance, known.covariance)
 
     notes = {"hand_rotation": camera.rotation, "hand_position": camera.position.reshape(3, 1)}
-    known.replace(posed=False).save(tmp_path / "hand.yml", notes)
-    assert not Camera.load(tmp_path / "hand.yml").posed
+    known.replace(has_extrinsics=False).save(tmp_path / "hand.yml", notes)
+    assert not Camera.load(tmp_path / "hand.yml").has_extrinsics
     hand = np.eye(4)
     hand[:3, :3], hand[:3, 3] = Rotation.from_rotvec([0.3, -1, 2]).as_matrix(), [0.2, 0.1, 0.3]
     posed = Camera.load(tmp_path / "hand.yml", hand)
-    assert posed.posed and (posed.covariance == known.covariance).all()
+    assert posed.has_extrinsics and (posed.covariance == known.covariance).all()
     np.testing.assert_allclose(posed.rotation, hand[:3, :3] @ camera.rotation, atol=1e-15)
     np.testing.assert_allclose(posed.position, hand[:3, :3] @ camera.position + hand[:3, 3], atol=1e-15)
     with pytest.raises(UserError, match="has no hand_rotation: this camera was not calibrated on a hand"):

@@ -1,7 +1,4 @@
-"""`arm5dof vision ...`: what the command line does with cameras. Declared here, imported by `arm5dof.cli`.
-
-Declaring must be quick, so everything that takes OpenCV or JAX is imported where it is used.
-"""
+"""`arm5dof vision calibrate`."""
 
 from __future__ import annotations
 
@@ -11,25 +8,19 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from arm5dof.cli.vision import detect as detect_command
-from arm5dof.cli.vision import doctor as doctor_command
-from arm5dof.cli.vision import eval as eval_command
-from arm5dof.cli.vision import hand_eye as hand_eye_command
-from arm5dof.cli.vision import locate as locate_command
 from arm5dof.cli.vision import options
-from arm5dof.cli.vision import pose as pose_command
-from arm5dof.cli.vision import train as train_command
 from arm5dof.runtime import files
 
 if TYPE_CHECKING:
-    from arm5dof.vision.calibration.intrinsics import Calibration, Views
+    from arm5dof.vision.calibration.intrinsics import Calibration
+    from arm5dof.vision.calibration.views import BoardViews
 
-CALIBRATE_HELP = """\
+HELP = """\
 Calibrate a camera from photographs of a board.
 
 Print a checkerboard, glue it to something flat, measure a square with a ruler, and take 10 to 20 photographs with the
 camera at its working focus: the whole board in each, tilted by 30 to 45 degrees to all sides, near and far, in the
-middle and in the corners of the picture. Do not move zoom or focus between them.
+middle and in the corners of the image. Do not move zoom or focus between them.
 
   arm5dof vision calibrate photos/ --board 9x6 --square 0.025 --out camera.yml
   arm5dof vision calibrate *.jpg --board 9x6 --square 0.025 --out camera.yml --preview straight.png
@@ -42,14 +33,11 @@ photographs are too few, show another board, or leave the intrinsics uncertain.
 """
 
 
-def declare(parser: argparse.ArgumentParser) -> None:
-    """Add the vision commands to the parser of `arm5dof vision`."""
-    parser.set_defaults(run=lambda known, rest: parser.print_help())
-    commands = parser.add_subparsers(metavar="COMMAND")
+def declare(commands: argparse._SubParsersAction) -> None:
+    """Add `calibrate` to the vision commands."""
     raw = argparse.RawDescriptionHelpFormatter
-
     p = commands.add_parser(
-        "calibrate", help="calibrate a camera from photographs", description=CALIBRATE_HELP, formatter_class=raw
+        "calibrate", help="calibrate a camera from photographs", description=HELP, formatter_class=raw
     )
     p.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="photographs, or folders of them")
     options.add_board(p)
@@ -63,51 +51,40 @@ def declare(parser: argparse.ArgumentParser) -> None:
     p.add_argument("--out", type=Path, required=True, metavar="CAMERA.yml", help="where the camera goes")
     p.add_argument("--preview", type=Path, metavar="OUT.png", help="a photograph before and after undistortion")
     p.add_argument("--json", action="store_true", help="print one JSON object")
-    p.set_defaults(run=calibrate)
-
-    pose_command.declare(commands)
-    hand_eye_command.declare(commands)
-    detect_command.declare(commands)
-    locate_command.declare(commands)
-    train_command.declare(commands)
-    eval_command.declare(commands)
-    doctor_command.declare(commands)
+    p.set_defaults(run=run)
 
 
-def calibrate(known: argparse.Namespace, rest: list[str]) -> None:
+def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision calibrate`."""
     options.nothing_left(rest, "calibrate")
-    options.writable(known.out, (".yml", ".yaml"))
-    if known.preview is not None:
-        options.writable(known.preview, (".png", ".jpg"))
+    options.writable(args.out, (".yml", ".yaml"))
+    if args.preview is not None:
+        options.writable(args.preview, (".png", ".jpg"))
 
     from arm5dof.runtime.progress import late_bar
-    from arm5dof.vision.calibration import intrinsics as calibration
+    from arm5dof.vision.calibration.intrinsics import calibrate, preview
+    from arm5dof.vision.calibration.views import find_views, image_names
     from arm5dof.vision.io.sources import image_files
 
-    paths = image_files(known.images)
-    board = options.board(known)
-    with late_bar("looking for the board", len(paths), "photographs") as progress:
-        views = calibration.find_views(paths, board, progress)
-    result = calibration.calibrate(views, known.distortion)
-    used = next(path for path, name in zip(paths, calibration.names(paths), strict=True) if name in result.errors)
-    notes = {
-        "nframes": len(result.errors),
-        "board": str(board),
-        "square_size": known.square,
-        "avg_reprojection_error": result.rms,
-        "intrinsics_standard_deviations": result.deviations.reshape(-1, 1),
-    }
+    paths = image_files(args.images)
+    board = options.board(args.board, args.square, args.charuco, args.dictionary)
+    with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
+        views = find_views(paths, board, progress)
+    result = calibrate(views, args.distortion)
     # Both files or none: the preview takes its place when the camera has been written.
     with ExitStack() as stack:
-        if known.preview is not None:
-            encoded = calibration.preview(used, result.camera, known.preview.suffix)
-            stack.enter_context(files.replacing(known.preview)).write_bytes(encoded)
-        result.camera.save(known.out, notes)
-    print(json.dumps(as_json(views, result)) if known.json else table(views, result) + f"\ncamera: {known.out}")
+        if args.preview is not None:
+            used = next(p for p, name in zip(paths, image_names(paths), strict=True) if name in result.errors)
+            encoded = preview(used, result.camera, args.preview.suffix)
+            stack.enter_context(files.replacing(args.preview)).write_bytes(encoded)
+        result.save(args.out, board)
+    if args.json:
+        print(json.dumps(as_json(views, result)))
+    else:
+        print(f"{calibration_table(views, result)}\ncamera: {args.out}")
 
 
-def table(views: Views, result: Calibration) -> str:
+def calibration_table(views: BoardViews, result: Calibration) -> str:
     """What a calibration found, for people."""
     from arm5dof.vision.calibration.intrinsics import INTRINSICS
 
@@ -126,7 +103,7 @@ def table(views: Views, result: Calibration) -> str:
     return "\n".join([*lines, "", f"{len(result.errors)} photographs of {size}, error {result.rms:.3f} pixels RMS"])
 
 
-def as_json(views: Views, result: Calibration) -> dict[str, Any]:
+def as_json(views: BoardViews, result: Calibration) -> dict[str, Any]:
     """The same for programs."""
     from arm5dof.vision.calibration.intrinsics import INTRINSICS
 

@@ -77,5 +77,5 @@ def _outputs(args: argparse.Namespace, source: Source) -> Iterator[list[Write]]:
         if args.json:
             writers.append(stack.enter_context(sinks.json_list(sys.stdout)))
         elif args.out is None:
-            writers.append(stack.enter_context(sinks.table(sys.stdout)))
+            writers.append(stack.enter_context(sinks.detection_table(sys.stdout)))
         yield writers

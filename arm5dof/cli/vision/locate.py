@@ -1,17 +1,18 @@
-"""`arm5dof vision locate`. Everything that takes OpenCV or JAX is imported where it is used."""
+"""`arm5dof vision locate`."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from itertools import starmap
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import detecting, locating, options
+from arm5dof.cli.vision import detecting, options
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
@@ -20,14 +21,14 @@ if TYPE_CHECKING:
     from arm5dof.vision.frames import Frame
     from arm5dof.vision.io.sinks import Write
     from arm5dof.vision.io.sources import Source
-    from arm5dof.vision.localization.locate import Located
+    from arm5dof.vision.localization.common import Localization
 
 HELP = """\
-Tell where things are, in the arm's base frame.
+Tell where objects are, in the arm's base frame.
 
 SOURCE is what vision detect takes: a photograph, several, folders of them, a video, or a camera by its number; or
-simulated, for random scenes, whose cameras are known. Things are detected first, by the shipped detector or --detector.
-Or it is the JSON that vision detect wrote; - reads that from a pipe.
+simulated, for random scenes, whose cameras are known. Objects are detected first, by the shipped detector or
+--detector. Or it is the JSON that vision detect wrote; - reads that from a pipe.
 
   arm5dof vision locate simulated:5 --out placed
   arm5dof vision locate photo.jpg --camera posed.yml
@@ -38,25 +39,25 @@ Or it is the JSON that vision detect wrote; - reads that from a pipe.
 The camera file must have the camera's pose: see arm5dof vision pose and hand-eye. A camera on the hand takes the hand's
 pose at the moment of the photograph with --hand.
 
---height NAME=METRES says how high the middle of a NAME is above the table, half its height as it lies there. How wide
+--height NAME=METRES says how high the center of a NAME is above the table, half its height as it lies there. How wide
 it is does not matter, but its form does: NAME=METRES:block is the default and means anything with the same outline all
-the way up, :ball what is rounded above and below, :cone what is pointed. Without any --height, things are those of the
+the way up, :ball what is rounded above and below, :cone what is pointed. Without any --height, objects are those of the
 simulated table, whose heights are known.
 
-There are three ways. By one picture: things stand on the table, and where the line of sight meets it is where they are.
+There are three ways. By one image: objects stand on the table, and where the line of sight meets it is where they are.
 By a depth image that shows what the camera shows, which rests less on the boxes and on the table's height:
 
   arm5dof vision locate photo.jpg --camera posed.yml --depth depth.png
 
-By two pictures of the same moment, each with its camera. Things need not stand on the table:
+By two images of the same moment, each with its camera. Objects need not stand on the table:
 
   arm5dof vision locate left.json right.json --camera left.yml --camera right.yml --height cup=0.045
 
-Printed are millimetres, and standard deviations that follow from those of the cameras, the boxes (--pixels), the depth
-image (--depth-error) and the heights (half a millimetre). With --json: a list of frames, {"name", "things"}, and in
+Printed are millimetres, and standard deviations that follow from those of the cameras, the boxes (--box-std), the depth
+image (--depth-error) and the heights (half a millimetre). With --json: a list of frames, {"name", "objects"}, and in
 that for each detection {"class_name", "confidence", "position", "covariance", "reason"}, metres and square metres in
 the base frame; what cannot be located has null for both, and a reason. Of images there are also each frame's "time_s"
-and "image_size", and each thing's "class_id" and "xyxy", as in vision detect.
+and "image_size", and each object's "class_id" and "xyxy", as in vision detect.
 
 With --out a new folder gets positions.json, which is that list, and the images, or the video as MP4, in which each box
 has its class and x, y and z in millimetres, or the reason. An interrupted or damaged source leaves whole files of the
@@ -67,69 +68,105 @@ frames before, as with vision detect.
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `locate` to the vision commands."""
     raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("locate", help="tell where things are", description=HELP, formatter_class=raw)
+    p = commands.add_parser("locate", help="tell where objects are", description=HELP, formatter_class=raw)
     p.add_argument(
         "source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, simulated; or JSON"
     )
-    locating.add_options(p)
+    p.add_argument(
+        "--camera", type=Path, action="append", default=[], metavar="CAMERA.yml", help="a camera with a pose; or two"
+    )
+    p.add_argument(
+        "--height",
+        type=_height,
+        action="append",
+        default=[],
+        metavar="NAME=METRES[:FORM]",
+        help="of the center of a class of objects above the table; repeatable; default: those of the simulated table",
+    )
+    p.add_argument("--table", type=float, default=0.0, metavar="METRES", help="height of the table; default 0")
+    p.add_argument(
+        "--box-std", type=float, default=1.0, metavar="PIXELS", help="standard deviation of a box's edges; default 1"
+    )
+    p.add_argument(
+        "--reach",
+        type=float,
+        nargs=2,
+        metavar=("MIN", "MAX"),
+        help="only what is so far from the origin of the base frame, metres",
+    )
+    p.add_argument(
+        "--hand",
+        type=float,
+        nargs=7,
+        metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
+        help="the hand's pose, for a camera on the hand",
+    )
+    p.add_argument("--depth", type=Path, metavar="DEPTH.png", help="the depth image of the one frame, in millimetres")
+    p.add_argument(
+        "--depth-error",
+        type=float,
+        default=0.002,
+        metavar="METRES",
+        help="standard deviation of the error that all depths of an object share; default 0.002",
+    )
     detecting.add_options(p)
     p.add_argument("--json", action="store_true", help="print JSON")
     p.set_defaults(run=run)
 
 
-def run(known: argparse.Namespace, rest: list[str]) -> int:
+def run(args: argparse.Namespace, rest: list[str]) -> int:
     """`arm5dof vision locate`."""
     options.nothing_left(rest, "locate")
-    locating.check(known)
-    listed = [_is_list(given) for given in known.source]
+    if not math.isfinite(args.table):
+        raise UserError(f"--table takes a height in metres, not {args.table:g}")
+    if not 0 <= args.depth_error < math.inf:
+        raise UserError(f"--depth-error takes metres, such as 0.002, not {args.depth_error:g}")
+    if len(args.camera) == 2 and (args.hand or args.depth):
+        raise UserError("--hand and --depth go with one camera: leave them out, or the second camera")
+    listed = [_is_list(given) for given in args.source]
     if any(listed) and not all(listed):
         raise UserError("images and DETECTIONS.json do not go together: give one or the other")
-    return _of_lists(known) if any(listed) else _of_frames(known)
+    return _run_on_lists(args) if any(listed) else _run_on_images(args)
 
 
-def _of_frames(known: argparse.Namespace) -> int:
-    """Detect in images, and place what is found."""
+def _run_on_images(args: argparse.Namespace) -> int:
+    """Detect in images, and locate what is found."""
     from arm5dof.vision.io.sources import open_source
 
-    source = open_source(known.source)
-    if source.drawn and (known.camera or known.hand or known.depth):
+    source = open_source(args.source)
+    if source.has_cameras and (args.camera or args.hand or args.depth):
         raise UserError("simulated scenes come with their cameras: leave out --camera, --hand and --depth")
-    if not source.drawn and len(known.camera) != 1:
-        remedy = "two go with two DETECTIONS.json" if known.camera else "arm5dof vision pose writes one"
+    if not source.has_cameras and len(args.camera) != 1:
+        remedy = "two go with two DETECTIONS.json" if args.camera else "arm5dof vision pose writes one"
         raise UserError(f"give one --camera CAMERA.yml with the camera's pose: {remedy}")
-    if known.depth and source.length != 1:
-        raise UserError(f"{known.depth} is the depth image of one frame: give the one image that goes with it")
-    cameras, method = locating.cameras(known), locating.method(known)
+    if args.depth and source.length != 1:
+        raise UserError(f"{args.depth} is the depth image of one frame: give the one image that goes with it")
+    cameras, locate = _load_cameras(args.camera, args.hand), _locator(args)
 
-    def place(frame: Frame, found: Detections) -> Located:
+    def place(frame: Frame, found: Detections) -> Localization:
         camera = frame.camera or cameras[0]
-        locating.check_size(frame.name, frame.image.shape[1::-1], camera)
-        return method([found], [camera])
+        _check_size(frame.name, frame.image.shape[1::-1], camera)
+        return locate(found, camera)
 
-    return detecting.run(known, source, _outputs(known, source, place))
+    return detecting.run(args, source, _outputs(args.out, args.json, source, place))
 
 
 @contextmanager
 def _outputs(
-    known: argparse.Namespace, source: Source, place: Callable[[Frame, Detections], Located]
+    out: Path | None, as_json: bool, source: Source, place: Callable[[Frame, Detections], Localization]
 ) -> Iterator[list[Write]]:
-    """What the command line asks for, as one function that places things first."""
-    from arm5dof.vision.io import placed
-    from arm5dof.vision.io import sinks as outputs
-
-    def table(frame: Frame, found: Located) -> None:
-        at = "" if frame.time is None else f" at {frame.time:.2f} s"
-        print(placed.table(frame.name + at, found), flush=True)
+    """What the command line asks for, as one function that locates objects first."""
+    from arm5dof.vision.io import localizations, sinks
 
     with ExitStack() as stack:
         asked: list[Write] = []
-        if known.out is not None:
-            how = "positions.json", placed.frame_as_json, placed.draw
-            asked.append(stack.enter_context(outputs.folder(known.out, source, *how)))
-        if known.json:
-            asked.append(stack.enter_context(outputs.json_list(sys.stdout, placed.frame_as_json)))
-        elif known.out is None:
-            asked.append(table)
+        if out is not None:
+            how = "positions.json", localizations.frame_as_json, localizations.draw
+            asked.append(stack.enter_context(sinks.folder(out, source, *how)))
+        if as_json:
+            asked.append(stack.enter_context(sinks.json_list(sys.stdout, localizations.frame_as_json)))
+        elif out is None:
+            asked.append(stack.enter_context(localizations.localization_table(sys.stdout)))
 
         def write(frame: Frame, found: Detections) -> None:
             located = place(frame, found)
@@ -139,46 +176,98 @@ def _outputs(
         yield [write]
 
 
-def _of_lists(known: argparse.Namespace) -> int:
-    """Place what was found before."""
-    if len(known.source) != len(known.camera) or len(known.camera) > 2:
+def _run_on_lists(args: argparse.Namespace) -> int:
+    """Locate what was detected before."""
+    if len(args.source) != len(args.camera) or len(args.camera) > 2:
         raise UserError("give one DETECTIONS.json and its --camera, or two and theirs in the same order")
-    if needless := detecting.given(known):
+    if needless := detecting.given(args):
         raise UserError(f"leave out {', '.join(needless)}: that takes images, and DETECTIONS.json has none")
 
     from arm5dof.runtime.progress import Bar
-    from arm5dof.vision.io import placed
+    from arm5dof.vision.io import localizations
 
-    cameras, answers = locating.cameras(known), []
-    moments = _moments([Path(given) for given in known.source], cameras)
-    if known.depth and len(moments) != 1:
-        raise UserError(f"{known.depth} is the depth image of one frame, and {known.source[0]} has {len(moments)}")
-    method = locating.method(known)
+    cameras, answers = _load_cameras(args.camera, args.hand), []
+    moments = _read_moments([Path(given) for given in args.source], cameras)
+    if args.depth and len(moments) != 1:
+        raise UserError(f"{args.depth} is the depth image of one frame, and {args.source[0]} has {len(moments)}")
+    locate = _locator(args)
     with Bar("locating", len(moments), "frames") as bar:
         bar.update(0, "starting")
         for name, found in moments:
-            answers.append((name, method(found, cameras)))
+            answers.append((name, locate(found, cameras)))
             bar.update(len(answers), name or "")
-    rows = [placed.as_json(*answer) for answer in answers]
-    print(json.dumps(rows) if known.json else "\n".join(starmap(placed.table, answers)))
+    if args.json:
+        print(json.dumps([localizations.as_json(*answer) for answer in answers]))
+    else:
+        print("\n".join(localizations.as_text(*answer) for answer in answers))
     return 0
 
 
-def _moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[str | None, list[Detections]]]:
-    """The names of frames, and what each camera's picture shows there."""
+def _locator(args: argparse.Namespace) -> Callable[..., Localization]:
+    """`locate` with what the command line says of objects, table, depths and errors. Raises `UserError` for heights, a
+    depth image or a reach that cannot be."""
+    from arm5dof.vision.io.sources import read_depth
+    from arm5dof.vision.localization import locate
+    from arm5dof.vision.localization.common import within_distance
+    from arm5dof.vision.localization.solids import CATALOGUE_SOLIDS, Solid
+
+    solids = {name: Solid(half, form) for name, half, form in args.height} or CATALOGUE_SOLIDS
+    depth = None if args.depth is None else read_depth(args.depth)
+    if args.reach is not None and not 0 <= args.reach[0] < args.reach[1]:
+        raise UserError(
+            "--reach takes the smallest distance and the largest, metres: not {:g} {:g}".format(*args.reach)
+        )
+    return partial(
+        locate,
+        solids=solids,
+        depth=depth,
+        table_height=args.table,
+        box_std=args.box_std,
+        depth_std=args.depth_error,
+        workspace=None if args.reach is None else within_distance(*args.reach),
+    )
+
+
+def _load_cameras(paths: Sequence[Path], hand: Sequence[float] | None) -> list[Camera]:
+    """The cameras in the files, with a word on those whose errors nobody has stated. Raises `UserError` if a file holds
+    none."""
+    from arm5dof.vision.calibration.poses import pose_from_quaternion
+    from arm5dof.vision.camera import Camera
+
+    hand_pose = None if hand is None else pose_from_quaternion(hand)
+    cameras = [Camera.load(path, hand_pose) for path in paths]
+    for path, camera in zip(paths, cameras, strict=True):
+        if camera.covariance is None:
+            print(
+                f"arm5dof: {path} does not say how well the camera is known, so the deviations leave that out; "
+                "vision calibrate and vision pose write it",
+                file=sys.stderr,
+            )
+    return cameras
+
+
+def _read_moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[str | None, list[Detections]]]:
+    """The names of frames, and what was detected there in each camera's image."""
     from arm5dof.vision.io import detections_file
 
     views = [detections_file.read(path) for path in paths]
     if len(views[0]) != len(views[-1]):
         raise UserError(
-            f"{paths[0]} has {len(views[0])} frames and {paths[-1]} {len(views[-1])}: give pictures of the same moments"
+            f"{paths[0]} has {len(views[0])} frames and {paths[-1]} {len(views[-1])}: give images of the same moments"
         )
     for frames, camera in zip(views, cameras, strict=True):
         for frame in frames:
             if frame.size is not None:
-                locating.check_size(frame.name, frame.size, camera)
+                _check_size(frame.name, frame.size, camera)
     moments = zip(*views, strict=True)
     return [(" + ".join(f.name for f in m if f.name) or None, [f.detections for f in m]) for m in moments]
+
+
+def _check_size(name: str | None, size: tuple[int, ...], camera: Camera) -> None:
+    """Raise `UserError` unless an image of that width and height is one of the camera's."""
+    if size != (camera.width, camera.height):
+        width, height = size
+        raise UserError(f"{name} has {width}x{height} pixels and the camera {camera.width}x{camera.height}")
 
 
 def _is_list(given: str) -> bool:
@@ -190,3 +279,12 @@ def _is_list(given: str) -> bool:
         return False
     with open(path, "rb") as file:
         return file.read(64).lstrip().startswith(b"[")
+
+
+def _height(text: str) -> tuple[str, float, str]:
+    name, _, rest = text.rpartition("=")
+    number, _, form = rest.partition(":")
+    try:
+        return name, float(number), form or "block"
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no NAME=METRES, such as cube=0.015") from None

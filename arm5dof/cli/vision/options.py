@@ -1,19 +1,17 @@
-"""What several vision commands take on the command line. Quick to import, like the commands."""
+"""What several vision commands take on the command line. Quick to import, as the commands are."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from arm5dof.vision.calibration.boards import Board
 
 
@@ -27,34 +25,29 @@ def add_board(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dictionary", metavar="NAME", help="of the ChArUco board's markers; default DICT_5X5_100")
 
 
-def board(known: argparse.Namespace) -> Board:
-    """The board that they describe. Raises `UserError` if there is none such."""
+def board(size: tuple[int, int], square: float, marker: float | None, dictionary: str | None) -> Board:
+    """The board that they describe: a ChArUco board if its markers have a side. Raises `UserError` if there is none
+    such."""
     from arm5dof.vision.calibration.boards import Charuco, Checkerboard
 
-    columns, rows = known.board
-    if known.charuco is not None:
-        return Charuco(columns, rows, known.square, known.charuco, known.dictionary or "DICT_5X5_100")
-    if known.dictionary is not None:
+    if marker is not None:
+        return Charuco(*size, square, marker, dictionary or "DICT_5X5_100")
+    if dictionary is not None:
         raise UserError("--dictionary belongs to a ChArUco board: give the side of its markers with --charuco")
-    return Checkerboard(columns, rows, known.square)
+    return Checkerboard(*size, square)
 
 
-def pose(numbers: Sequence[float]) -> np.ndarray:
-    """The pose (4, 4) of a frame from its place x y z (metres) and its turn as a quaternion w x y z. Raises `UserError`
-    if they are not seven finite numbers with a quaternion of length 1."""
-    import mujoco
-    import numpy as np
+@contextmanager
+def board_remedy() -> Iterator[None]:
+    """Where images show a checkerboard of another size, say how to ask for it."""
+    from arm5dof.vision.calibration.boards import BoardNotFoundError
 
-    if len(numbers) != 7 or not all(map(math.isfinite, numbers)):
-        raise UserError("a pose is seven numbers: x y z in metres and the quaternion w x y z")
-    quaternion = np.array(numbers[3:], float)
-    length = np.linalg.norm(quaternion)
-    if abs(length - 1) > 0.01:
-        raise UserError(f"a quaternion w x y z has length 1, not {length:.3g}")
-    rotation, matrix = np.zeros(9), np.eye(4)
-    mujoco.mju_quat2Mat(rotation, quaternion / length)
-    matrix[:3, :3], matrix[:3, 3] = rotation.reshape(3, 3), numbers[:3]
-    return matrix
+    try:
+        yield
+    except BoardNotFoundError as error:
+        if error.size is None:
+            raise
+        raise UserError(f"{error}: give --board {error.size}") from None
 
 
 def nothing_left(rest: Sequence[str], command: str) -> None:

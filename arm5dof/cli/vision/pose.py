@@ -1,4 +1,4 @@
-"""`arm5dof vision pose`. Everything that takes OpenCV or JAX is imported where it is used."""
+"""`arm5dof vision pose`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ import argparse
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.vision import camera_report, options
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from arm5dof.vision.camera import Camera
 
 HELP = """\
 Find where a camera stands, from one photograph of a board whose place is known.
@@ -57,65 +55,35 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.set_defaults(run=run)
 
 
-def run(known: argparse.Namespace, rest: list[str]) -> None:
+def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision pose`."""
     options.nothing_left(rest, "pose")
-    options.writable(known.out, (".yml", ".yaml"))
-    board_to_base, placed = _at(known.at), _placed(known.placed)
+    options.writable(args.out, (".yml", ".yaml"))
+    board_to_base, placement_std = _at(args.at), _placed(args.placed)
 
     from arm5dof.vision.calibration.extrinsics import from_board
     from arm5dof.vision.camera import Camera
 
-    board = options.board(known)
-    camera = from_board(Camera.load(known.camera), known.image, board, board_to_base, placed)
-    camera.save(known.out, {"board": str(board), "square_size": known.square})
-    print(json.dumps(as_json(camera)) if known.json else f"{table(camera)}\ncamera: {known.out}")
-
-
-def as_json(camera: Camera) -> dict[str, Any]:
-    """Where a camera stands, for programs: its position in metres, its rotation as a matrix, and standard deviations of
-    a turn about its own axes (degrees) and a shift along them (metres), null if unknown."""
-    import numpy as np
-
-    deviations = None
-    if camera.covariance is not None:
-        turn, shift = np.split(np.sqrt(np.diag(np.asarray(camera.covariance))[-6:]), 2)
-        deviations = {"turn_deg": np.rad2deg(turn).tolist(), "shift_m": shift.tolist()}
-    position, rotation = np.asarray(camera.position), np.asarray(camera.rotation)
-    return {"position_m": position.tolist(), "rotation": rotation.tolist(), "deviations": deviations}
-
-
-def table(camera: Camera, frame: str = "base") -> str:
-    """The same for people."""
-    said = as_json(camera)
-
-    def spread(name: str, factor: float, unit: str) -> str:
-        if said["deviations"] is None:
-            return ""
-        return "  +- " + " ".join(f"{factor * v:.2f}" for v in said["deviations"][name]) + f" {unit}"
-
-    position = " ".join(f"{1e3 * v:.1f}" for v in said["position_m"])
-    looks = " ".join(f"{row[2]:.4f}" for row in said["rotation"])
-    width = max(len(position) + 3, len(looks))
-    lines = [
-        f"the camera in the {frame} frame, +- standard deviations along and about the camera's own axes",
-        f"stands at  {f'{position} mm':{width}}{spread('shift_m', 1e3, 'mm')}",
-        f"looks to   {looks:{width}}{spread('turn_deg', 1, 'degrees')}",
-    ]
-    if said["deviations"] is None:
-        lines.append("how well is unknown: the camera file has no covariance; vision calibrate writes one")
-    return "\n".join(lines)
+    board = options.board(args.board, args.square, args.charuco, args.dictionary)
+    with options.board_remedy():
+        camera = from_board(Camera.load(args.camera), args.image, board, board_to_base, placement_std)
+    camera.save(args.out, {"board": str(board), "square_size": board.square})
+    if args.json:
+        print(json.dumps(camera_report.as_json(camera)))
+    else:
+        print(f"{camera_report.pose_table(camera)}\ncamera: {args.out}")
 
 
 def _at(numbers: list[float]) -> np.ndarray:
     """The board's pose (4, 4)."""
     if len(numbers) not in (4, 7) or not all(map(math.isfinite, numbers)):
         raise UserError("--at takes X Y Z TURN (metres, degrees) or X Y Z QW QX QY QZ")
+    from arm5dof.vision.calibration.poses import lying_board, pose_from_quaternion
+
     if len(numbers) == 7:
-        return options.pose(numbers)
-    half = math.radians(numbers[3]) / 2
-    # The rows turn about the base's z axis; then the board turns over, its z axis being that into the table.
-    return options.pose([*numbers[:3], 0.0, math.cos(half), math.sin(half), 0.0])
+        return pose_from_quaternion(numbers)
+    x, y, z, degrees = numbers
+    return lying_board(x, y, z, math.radians(degrees))
 
 
 def _placed(given: tuple[float, float]) -> tuple[float, float]:

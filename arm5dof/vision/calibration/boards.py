@@ -1,4 +1,4 @@
-"""Calibration boards and their corners in a photograph: checkerboards and ChArUco boards.
+"""Calibration boards and their corners in an image: checkerboards and ChArUco boards.
 
 A board's frame has its origin in the first inner corner, x along the rows of corners, y down the columns, z into the
 board, away from the camera.
@@ -17,7 +17,7 @@ import numpy as np
 from arm5dof.errors import UserError
 
 DETECTION_SIZE = 1280
-"""Boards are looked for in pictures reduced to at most so many pixels a side; corners are refined in the original."""
+"""Boards are looked for in images reduced to at most so many pixels a side; corners are refined in the original."""
 
 WINDOW = 0.25
 """Half the corner window, as a share of the smallest distance between corners. Windows that reach into the next
@@ -27,42 +27,66 @@ corners pull it off its place: OpenCV's sample takes 11 pixels always, and one o
 REFINE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
 
 RADIUS, SAMPLES = 0.25, 16
-"""Of the circle, in squares, on which a corner is recognised by its four alternating quarters; points on it."""
+"""Of the circle, in squares, on which a corner is recognized by its four alternating quarters; points on it."""
+
+
+class BoardNotFoundError(UserError):
+    """Images do not show the board that they should."""
+
+    def __init__(self, message: str, size: str | None = None) -> None:
+        super().__init__(message)
+        self.size = size
+        """The inner corners, such as `9x6`, of the checkerboard that they show instead; None if they show none."""
 
 
 class Corners(NamedTuple):
-    """What of a board was seen in a photograph."""
+    """What of a board was seen in an image."""
 
     points: np.ndarray
     """Corners in the board's frame, (n, 3), float32, metres."""
     pixels: np.ndarray
-    """The same in the picture, (n, 2), float32."""
+    """The same in the image, (n, 2), float32, pixels."""
 
 
 class Board(Protocol):
-    """Something flat with corners at known places."""
+    """Something flat with corners at known places. `str` names it."""
 
     @property
-    def turns(self) -> bool:
-        """Whether it looks the same when turned by half a turn, so that its pose is ambiguous."""
+    def square(self) -> float:
+        """The side of a square, metres."""
 
-    def find(self, grey: np.ndarray) -> Corners | None:
-        """The board's corners in a picture (h, w), uint8; None if it is not seen."""
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether it looks the same after half a turn, so that an image leaves its pose open."""
 
-    def inspect(self, grey: np.ndarray, found: Corners | None) -> tuple[int, ...]:
-        """What kind of board a picture shows, whether or not this one was found in it."""
+    def find(self, gray: np.ndarray) -> Corners | None:
+        """Find the board.
 
-    def mismatch(self, notes: Sequence[tuple[int, ...]]) -> str | None:
-        """What to tell the user if photographs, by what `inspect` says of each, show another board than this."""
+        Args:
+            gray: (h, w), uint8.
+
+        Returns:
+            Its corners, to a fraction of a pixel; None if it is not seen.
+        """
+
+    def inspect(self, gray: np.ndarray, found: Corners | None) -> tuple[int, ...]:
+        """What kind of board an image (h, w) shows, whether or not this one was `found` in it."""
+
+    def check_inspected(self, notes: Sequence[tuple[int, ...]], context: str) -> None:
+        """Raise `BoardNotFoundError`, its message beginning with `context`, if images show another board than this or
+        none, by what `inspect` says of each."""
 
 
 @dataclass(frozen=True)
 class Checkerboard:
-    """A checkerboard with so many inner corners along and down, and squares of so many metres."""
+    """A checkerboard. Raises `UserError` for one that cannot be."""
 
     columns: int
+    """Inner corners along a row."""
     rows: int
+    """Inner corners down a column."""
     square: float
+    """The side of a square, metres."""
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:
@@ -73,75 +97,81 @@ class Checkerboard:
         return f"{self.columns}x{self.rows} checkerboard"
 
     @property
-    def turns(self) -> bool:
+    def is_ambiguous(self) -> bool:
         """Black meets white under half a turn only if one number is odd and the other even."""
         return (self.columns + self.rows) % 2 == 0
 
     @property
     def points(self) -> np.ndarray:
-        """Corners in the board's frame, (rows * columns, 3), row by row."""
+        """Corners in the board's frame, (rows * columns, 3) float32, metres, row by row."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return (np.stack([x, y, 0 * x], -1) * self.square).astype(np.float32).reshape(-1, 3)
 
-    def find(self, grey: np.ndarray) -> Corners | None:
+    def find(self, gray: np.ndarray) -> Corners | None:
         """The corners, refined, the first one being that where the square before it is black if the board tells."""
-        grid = self._detect(grey)
+        grid = self._detect(gray)
         if grid is None:
             return None
-        grid = refine(grey, grid)
-        if _saddles(grey, grid).mean() < 0.9:
+        grid = refine(gray, grid)
+        if _saddles(gray, grid).mean() < 0.9:
             return None
         (a, b), (c, d) = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
         if a * d < b * c:  # Seen from behind, says the order; so it is the order that is wrong.
             grid = grid[::-1]
-        if not self.turns and _first_is_white(grey, grid):
+        if not self.is_ambiguous and _first_is_white(gray, grid):
             grid = grid[::-1, ::-1]
         return Corners(self.points, grid.reshape(-1, 2).copy())
 
-    def _detect(self, grey: np.ndarray) -> np.ndarray | None:
+    def _detect(self, gray: np.ndarray) -> np.ndarray | None:
         """Rough corners (rows, columns, 2). The first detector is quick and misses few, the second misses others."""
         size = (self.columns, self.rows)
-        small, scale = _reduced(grey)
+        small, scale = _reduced(gray)
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, pixels = cv2.findChessboardCorners(small, size, flags=flags)
         if found:
             pixels = (pixels + 0.5) / scale - 0.5
         else:
-            found, pixels = cv2.findChessboardCornersSB(grey, size)
+            found, pixels = cv2.findChessboardCornersSB(gray, size)
         return pixels.reshape(self.rows, self.columns, 2).astype(np.float32) if found else None
 
-    def inspect(self, grey: np.ndarray, found: Corners | None) -> tuple[int, ...]:
+    def inspect(self, gray: np.ndarray, found: Corners | None) -> tuple[int, ...]:
         """The larger and the smaller number of corners of the whole board: a part of it can pass for a smaller one."""
         if found is not None:
-            size: tuple[int, ...] = _whole_size(grey, found.pixels.reshape(self.rows, self.columns, 2))
+            size: tuple[int, ...] = _whole_size(gray, found.pixels.reshape(self.rows, self.columns, 2))
         else:
-            seen, _, meta = cv2.findChessboardCornersSBWithMeta(_reduced(grey)[0], (3, 3), cv2.CALIB_CB_LARGER)
+            seen, _, meta = cv2.findChessboardCornersSBWithMeta(_reduced(gray)[0], (3, 3), cv2.CALIB_CB_LARGER)
             size = meta.shape[:2] if seen else ()
         return tuple(sorted(size, reverse=True))
 
-    def mismatch(self, notes: Sequence[tuple[int, ...]]) -> str | None:
-        """Another size that more of the photographs show."""
+    def check_inspected(self, notes: Sequence[tuple[int, ...]], context: str) -> None:
+        """Refuse images of which more show another size than this."""
         votes = Counter(size for size in notes if size)
         if not votes:
-            return "none of them shows any: the whole board must be seen, with a white margin and in focus"
+            raise BoardNotFoundError(
+                f"{context}; none of them shows any: the whole board must be seen, with a white margin and in focus"
+            )
         own = votes[max(self.columns, self.rows), min(self.columns, self.rows)]
         size, count = max(votes.items(), key=lambda item: item[1])
-        if count <= own:
-            return None
-        name = "x".join(map(str, size))
-        return f"{count} of the {len(notes)} show one of {name} inner corners: give --board {name}"
+        if count > own:
+            name = "x".join(map(str, size))
+            raise BoardNotFoundError(f"{context}; {count} of the {len(notes)} show one of {name} inner corners", name)
 
 
 @dataclass(frozen=True)
 class Charuco:
-    """A ChArUco board as OpenCV counts it: so many squares along and down, squares and markers of so many metres."""
+    """A ChArUco board as OpenCV counts it. Raises `UserError` for one that cannot be."""
 
     columns: int
+    """Squares along a row."""
     rows: int
+    """Squares down a column."""
     square: float
+    """The side of a square, metres."""
     marker: float
+    """The side of a marker, metres."""
     dictionary: str = "DICT_5X5_100"
-    turns = False
+    """OpenCV's name for the set of markers."""
+    is_ambiguous = False
 
     def __post_init__(self) -> None:
         _check_lengths(self.square)
@@ -149,9 +179,9 @@ class Charuco:
             raise UserError(f"board {self.columns}x{self.rows}: a ChArUco board has at least 3x3 squares")
         if not 0 < self.marker < self.square:
             raise UserError(f"markers of {self.marker:g} m do not fit into squares of {self.square:g} m")
-        known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-        if self.dictionary not in known:
-            raise UserError(f"no marker dictionary {self.dictionary!r}: choose from {', '.join(known)}")
+        names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+        if self.dictionary not in names:
+            raise UserError(f"no marker dictionary {self.dictionary!r}: choose from {', '.join(names)}")
         needed, there = self.columns * self.rows // 2, len(self._dictionary.bytesList)
         if needed > there:
             raise UserError(f"{self} needs {needed} markers and {self.dictionary} has {there}: which one was printed?")
@@ -168,50 +198,61 @@ class Charuco:
         """OpenCV's object, for instance to draw the board with `generateImage`."""
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._dictionary)
 
-    def find(self, grey: np.ndarray) -> Corners | None:
+    def find(self, gray: np.ndarray) -> Corners | None:
         """The corners that are seen, six at least and not all in a line; part of the board is enough."""
         board = self.opencv
-        pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
         if ids is None or len(ids) < 6 or board.checkCharucoCornersCollinear(ids):
             return None
         every = np.asarray(board.getChessboardCorners())
         points = every[ids.ravel()] - every[0]
         # The window must not reach into the markers, which begin this far from a corner.
         share = min(WINDOW, (1 - self.marker / self.square) / 2)
-        return Corners(points.astype(np.float32), refine(grey, pixels.reshape(-1, 2), share))
+        return Corners(points.astype(np.float32), refine(gray, pixels.reshape(-1, 2), share))
 
-    def inspect(self, grey: np.ndarray, found: Corners | None) -> tuple[int, ...]:
-        """The markers in a picture."""
-        _, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(grey)
+    def inspect(self, gray: np.ndarray, found: Corners | None) -> tuple[int, ...]:
+        """The markers in an image."""
+        _, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(gray)
         return () if ids is None else tuple(map(int, ids.ravel()))
 
-    def mismatch(self, notes: Sequence[tuple[int, ...]]) -> str | None:
-        """No markers at all, or more of them than this board has."""
+    def check_inspected(self, notes: Sequence[tuple[int, ...]], context: str) -> None:
+        """Refuse images without markers, or with more of them than this board has."""
         ids, there = [i for note in notes for i in note], self.columns * self.rows // 2
         if not ids:
-            return f"they show no marker of {self.dictionary}: which dictionary was printed?"
-        if 4 * sum(i >= there for i in ids) <= len(ids):
-            return None
-        return (
-            f"a board of {self.columns}x{self.rows} squares has the markers 0 to {there - 1} and the photographs show "
-            f"some up to {max(ids)}: count the squares along and down"
-        )
+            raise BoardNotFoundError(
+                f"{context}; they show no marker of {self.dictionary}: which dictionary was printed?"
+            )
+        if 4 * sum(i >= there for i in ids) > len(ids):
+            raise BoardNotFoundError(
+                f"{context}; a board of {self.columns}x{self.rows} squares has the markers 0 to {there - 1} and the "
+                f"photographs show some up to {max(ids)}: count the squares along and down"
+            )
 
 
 def refine(
-    grey: np.ndarray,
+    gray: np.ndarray,
     corners: np.ndarray,
     share: float = WINDOW,
     window: int | None = None,
     until: tuple[int, int, float] = REFINE,
 ) -> np.ndarray:
-    """Corners to a fraction of a pixel, in the shape given, (..., 2). `window` is half the side of the square that
-    each is found from, pixels; by default a `share` of the distance to the nearest corner."""
+    """Refine corners to a fraction of a pixel.
+
+    Args:
+        gray: (h, w), uint8.
+        corners: (..., 2), pixels.
+        share: Half the side of the square that each is found from, as a share of the distance to the nearest corner.
+        window: The same in pixels, instead.
+        until: OpenCV's criterion for when to stop.
+
+    Returns:
+        (..., 2) float32, pixels.
+    """
     pixels = corners.reshape(-1, 2).astype(np.float32)
     if window is None:
         apart = np.linalg.norm(pixels[:, None] - pixels, axis=-1) + np.diag(np.full(len(pixels), np.inf))
         window = int(np.clip(share * apart.min(), 2, 15))
-    return cv2.cornerSubPix(grey, pixels.reshape(-1, 1, 2).copy(), (window, window), (-1, -1), until).reshape(
+    return cv2.cornerSubPix(gray, pixels.reshape(-1, 1, 2).copy(), (window, window), (-1, -1), until).reshape(
         corners.shape
     )
 
@@ -221,25 +262,25 @@ def _check_lengths(square: float) -> None:
         raise UserError(f"squares of {square:g} m: give the side of a square in metres, such as 0.025")
 
 
-def _reduced(grey: np.ndarray) -> tuple[np.ndarray, float]:
-    """The picture, no larger than boards are looked for in, and by what factor it was reduced."""
-    scale = min(1.0, DETECTION_SIZE / max(grey.shape))
-    return (grey if scale == 1 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)), scale
+def _reduced(gray: np.ndarray) -> tuple[np.ndarray, float]:
+    """The image, no larger than boards are looked for in, and by what factor it was reduced."""
+    scale = min(1.0, DETECTION_SIZE / max(gray.shape))
+    return (gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)), scale
 
 
-def _sample(grey: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Grey values (...) at pixels (..., 2), by linear interpolation; 0 outside the picture."""
+def _sample(gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Gray values (...) at pixels (..., 2), by linear interpolation; 0 outside the image."""
     x, y = pixels.reshape(-1, 2).astype(np.float32).T
-    return cv2.remap(grey, x, y, cv2.INTER_LINEAR).reshape(pixels.shape[:-1]).astype(float)
+    return cv2.remap(gray, x, y, cv2.INTER_LINEAR).reshape(pixels.shape[:-1]).astype(float)
 
 
-def _saddles(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _saddles(gray: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """At which of the places (rows, columns, 2) four squares meet: around such a point bright and dark alternate
     twice, and at the rim of a board, or anywhere else, they do not."""
     angles = 2 * np.pi * (np.arange(SAMPLES) + 0.5) / SAMPLES
     along, down = (np.gradient(grid, axis=axis)[:, :, None] for axis in (1, 0))
     circle = RADIUS * (np.cos(angles)[:, None] * along + np.sin(angles)[:, None] * down)
-    values = _sample(grey, grid[:, :, None] + circle)
+    values = _sample(gray, grid[:, :, None] + circle)
     once, twice = (np.abs(values @ np.exp(1j * k * angles)) / SAMPLES for k in (1, 2))
     return (twice > 1.5 * once) & (twice > 5)
 
@@ -249,13 +290,13 @@ def _grown(grid: np.ndarray) -> np.ndarray:
     return np.concatenate([grid, 3 * grid[:, -1:] - 3 * grid[:, -2:-1] + grid[:, -3:-2]], axis=1)
 
 
-def _whole_size(grey: np.ndarray, grid: np.ndarray) -> tuple[int, int]:
+def _whole_size(gray: np.ndarray, grid: np.ndarray) -> tuple[int, int]:
     """How many corners along and down the board has, counted on from those found for as long as more follow."""
     turns, stuck = 0, 0
     while stuck < 4 and max(grid.shape) < 100:
         grown = _grown(grid)
-        if _saddles(grey, grown)[:, -1].mean() > 0.7:
-            grown[:, -1] = refine(grey, grown[:, -1])
+        if _saddles(gray, grown)[:, -1].mean() > 0.7:
+            grown[:, -1] = refine(gray, grown[:, -1])
             grid, stuck = grown, 0
         else:
             grid, stuck, turns = np.rot90(grid), stuck + 1, turns + 1
@@ -263,8 +304,8 @@ def _whole_size(grey: np.ndarray, grid: np.ndarray) -> tuple[int, int]:
     return (columns, rows) if turns % 2 == 0 else (rows, columns)
 
 
-def _first_is_white(grey: np.ndarray, grid: np.ndarray) -> bool:
+def _first_is_white(gray: np.ndarray, grid: np.ndarray) -> bool:
     """Whether the square between the first four corners is brighter than those beside it."""
-    middles = (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4
-    values, black = _sample(grey, middles), np.indices(middles.shape[:2]).sum(0) % 2 == 0
+    centers = (grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:]) / 4
+    values, black = _sample(gray, centers), np.indices(centers.shape[:2]).sum(0) % 2 == 0
     return bool(values[black].mean() > values[~black].mean())

@@ -1,4 +1,4 @@
-"""How well a camera is known: the covariance of what calibration estimates, in the order of `Camera.disturbed`.
+"""How well a camera is known: the covariance of what calibration estimates, in the order of `Camera.perturbed`.
 
 Standard deviations alone will not do. Errors of the focal length, the distortion and the pose hang together, and most
 of what they do to a pixel cancels; taken one by one they would make a camera look several times worse than it is.
@@ -15,13 +15,21 @@ from arm5dof.vision.calibration.boards import Corners
 from arm5dof.vision.camera import Camera
 
 
-def with_intrinsics(camera: Camera, views: Sequence[Corners], boards: Sequence[np.ndarray]) -> Camera:
-    """The camera that was calibrated from these views, with the covariance of its intrinsics. `boards` are the boards'
-    poses in the camera's frame (4, 4), estimated together with them."""
+def add_intrinsics_covariance(camera: Camera, views: Sequence[Corners], boards: Sequence[np.ndarray]) -> Camera:
+    """The covariance of a camera's intrinsics.
+
+    Args:
+        camera: It was calibrated from the views.
+        views: Corners in n photographs.
+        boards: The boards' poses in the camera's frame, (4, 4) each, estimated together with the camera.
+
+    Returns:
+        The camera with a covariance; that of its pose is zero.
+    """
     size = 4 + len(camera.distortion)
     information, squares, spare = np.zeros((size, size)), 0.0, -size
     for corners, board in zip(views, boards, strict=True):
-        residual, jacobian = linearise(camera, corners, board)
+        residual, jacobian = linearize(camera, corners, board)
         lens, pose = np.split(jacobian, [size], axis=1)
         # What of an error in the intrinsics the board's pose cannot make good.
         left = lens - pose @ np.linalg.lstsq(pose, lens, rcond=None)[0]
@@ -33,50 +41,75 @@ def with_intrinsics(camera: Camera, views: Sequence[Corners], boards: Sequence[n
     return camera.replace(covariance=covariance)
 
 
-def with_pose(camera: Camera, solve: Callable[[Camera], np.ndarray], noise: np.ndarray) -> Camera:
-    """The camera with the pose (4, 4) that `solve` finds for it, and the covariance of both. `noise` is the pose's
-    covariance (6, 6), a turn and a shift in the camera's own frame, were the intrinsics exact: what their errors do to
-    the pose is found by solving again."""
+def add_pose(camera: Camera, solve: Callable[[Camera], np.ndarray], noise: np.ndarray) -> Camera:
+    """A camera's pose, and the covariance of both: what errors of the intrinsics do to the pose is found by solving
+    again.
+
+    Args:
+        camera: With the covariance of its intrinsics, or with none.
+        solve: Finds a camera's pose, (4, 4), camera to base frame.
+        noise: The pose's covariance were the intrinsics exact, (6, 6): a rotation (radians) and a shift (metres) in the
+            camera's own frame.
+
+    Returns:
+        The camera with extrinsics and, if that of its intrinsics is known, their covariance.
+    """
     pose = solve(camera)
-    posed = camera.with_pose(pose[:3, :3], pose[:3, 3])
+    placed = camera.with_pose(pose[:3, :3], pose[:3, 3])
     if camera.covariance is None:
-        return posed
+        return placed
     lens = np.asarray(camera.covariance, float)[:-6, :-6]
     follows = np.zeros((6, len(lens)))
     for i, deviation in enumerate(np.sqrt(np.diag(lens))):
         if deviation:
             error = np.zeros(len(lens) + 6)
             error[i] = deviation
-            more, less = (_step(pose, solve(camera.disturbed(sign * error))) for sign in (1, -1))
+            more, less = (_step(pose, solve(camera.perturbed(sign * error))) for sign in (1, -1))
             follows[:, i] = (more - less) / (2 * deviation)
     both = lens @ follows.T
-    return posed.replace(covariance=np.block([[lens, both], [both.T, follows @ both + noise]]))
+    return placed.replace(covariance=np.block([[lens, both], [both.T, follows @ both + noise]]))
 
 
-def board_noise(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndarray:
-    """Covariance (6, 6) of the camera's pose beside a board, a turn and a shift in its own frame, by what separates the
-    corners from where they should be seen."""
-    residual, jacobian = linearise(camera, corners, board)
+def pose_covariance(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndarray:
+    """How well corners tell a camera's pose beside a board, by what separates them from where they should be seen.
+
+    Args:
+        camera: What saw them.
+        corners: Where.
+        board: The board's pose in the camera's frame, (4, 4).
+
+    Returns:
+        (6, 6): a rotation (radians) and a shift (metres) in the camera's own frame.
+    """
+    residual, jacobian = linearize(camera, corners, board)
     by_pose = jacobian[:, -6:]
     return np.linalg.inv(by_pose.T @ by_pose) * (residual @ residual) / (len(residual) - 6)
 
 
-def carried(placed: tuple[float, float], board: np.ndarray) -> np.ndarray:
-    """What it does to the camera's pose (6, 6) that a board, at the pose `board` (4, 4) in its frame, is `placed` only
-    so well: standard deviations of its place (metres) and its turn (radians), along and about each axis."""
+def placement_covariance(placement_std: tuple[float, float], board: np.ndarray) -> np.ndarray:
+    """What errors of a board's place do to the pose of the camera that sees it.
+
+    Args:
+        placement_std: Standard deviations of the board's position (metres) and rotation (radians), along and about each
+            axis.
+        board: The board's pose in the camera's frame, (4, 4).
+
+    Returns:
+        (6, 6): a rotation (radians) and a shift (metres) in the camera's own frame.
+    """
     turn = board[:3, :3]
     x, y, z = board[:3, 3]
     lever = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     # The turn of a board at its place moves a camera that sees it there.
     carry = np.block([[turn, np.zeros((3, 3))], [lever @ turn, turn]])
-    return carry @ np.diag(np.repeat(np.square(placed[::-1]), 3)) @ carry.T
+    return carry @ np.diag(np.repeat(np.square(placement_std[::-1]), 3)) @ carry.T
 
 
-def linearise(camera: Camera, corners: Corners, board: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What separates the corners of a board at the pose `board` (4, 4) in the camera's frame from where they were seen,
-    (2n,) pixels, and its derivative by the errors that `Camera.disturbed` takes, (2n, m)."""
+def linearize(camera: Camera, corners: Corners, board: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What separates the n corners of a board at the pose `board` (4, 4) in the camera's frame from where they were
+    seen, (2n,) pixels, and its derivative by the errors that `Camera.perturbed` takes, (2n, m)."""
     turn, _ = cv2.Rodrigues(board[:3, :3])
-    lens = np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
+    lens = camera.opencv
     pixels, jacobian = cv2.projectPoints(corners.points, turn, board[:3, 3], *lens)
     by_point = jacobian[:, 3:6].reshape(-1, 2, 3)
     x, y, z = (corners.points @ board[:3, :3].T + board[:3, 3]).T

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from arm5dof.errors import UserError
-from arm5dof.vision.calibration import covariance as uncertainty
+from arm5dof.vision.calibration import hand_eye
 from arm5dof.vision.calibration.boards import Board, Corners
-from arm5dof.vision.calibration.hand_eye import HandEye, eye_in_hand, eye_to_hand
-from arm5dof.vision.calibration.intrinsics import board_error, board_pose, names, read_grey
+from arm5dof.vision.calibration.covariance import add_pose, placement_covariance, pose_covariance
+from arm5dof.vision.calibration.hand_eye import HandEye
+from arm5dof.vision.calibration.views import board_error, board_pose, image_names, read_gray
 from arm5dof.vision.camera import Camera
 
 MAX_ERROR = 2.0
@@ -20,39 +21,71 @@ MAX_ERROR = 2.0
 
 
 def from_board(
-    camera: Camera, path: Path, board: Board, board_to_base: np.ndarray, placed: tuple[float, float] = (0.0, 0.0)
+    camera: Camera,
+    path: Path,
+    board: Board,
+    board_to_base: np.ndarray,
+    placement_std: tuple[float, float] = (0.0, 0.0),
 ) -> Camera:
-    """The camera with its pose, from one photograph of a board whose pose (4, 4) in the base frame is known. `placed`
-    says how well: standard deviations of the board's place (metres) and turn (radians), along and about each axis.
+    """Find a camera's pose from one photograph of a board at a known pose.
 
-    Raises `UserError` if the board is not seen, leaves its own pose open, or does not fit the camera's intrinsics."""
+    Args:
+        camera: The calibrated camera.
+        path: The photograph.
+        board: What it shows.
+        board_to_base: The board's pose in the base frame, (4, 4), metres.
+        placement_std: How well that is known: standard deviations of the board's position (metres) and rotation
+            (radians), along and about each axis.
+
+    Returns:
+        The camera with extrinsics and, if that of its intrinsics is known, the covariance of both.
+
+    Raises:
+        BoardNotFoundError: The photograph shows another board, or none.
+        UserError: The board is not seen whole, leaves its own pose open, or does not fit the camera's intrinsics; or
+            the photograph cannot be read.
+        OSError: It cannot be read.
+    """
     corners = find(camera, path, board)
     if corners is None:
-        mismatch = board.mismatch([board.inspect(read_grey(path), None)])
-        raise UserError(f"{path} does not show the {board}; {mismatch or 'is it seen whole, in focus?'}")
-    return from_corners(camera, corners, board_to_base, placed)
+        context = f"{path} does not show the {board}"
+        board.check_inspected([board.inspect(read_gray(path), None)], context)
+        raise UserError(f"{context}; is it seen whole, in focus?")
+    return from_corners(camera, corners, board_to_base, placement_std)
 
 
 def from_corners(
-    camera: Camera, corners: Corners, board_to_base: np.ndarray, placed: tuple[float, float] = (0.0, 0.0)
+    camera: Camera, corners: Corners, board_to_base: np.ndarray, placement_std: tuple[float, float] = (0.0, 0.0)
 ) -> Camera:
     """The same from corners that have been found."""
     seen = board_pose(camera, corners)
-    noise = uncertainty.board_noise(camera, corners, seen) + uncertainty.carried(placed, seen)
-    return uncertainty.with_pose(camera, lambda c: board_to_base @ np.linalg.inv(board_pose(c, corners)), noise)
+    noise = pose_covariance(camera, corners, seen) + placement_covariance(placement_std, seen)
+    return add_pose(camera, lambda c: board_to_base @ np.linalg.inv(board_pose(c, corners)), noise)
 
 
 @dataclass(frozen=True)
-class FromHand:
+class HandEyeCalibration:
     """What the hand's movements told of a camera."""
 
     camera: Camera
-    """Its pose is in the base frame or, of a camera on the hand, in the hand's."""
+    """Its pose is in the base frame or, if it is on the hand, in the hand's frame."""
+    eye_in_hand: bool
+    """Whether it is on the hand."""
     hand_eye: HandEye
+    """The pose before the intrinsics' errors are taken into account, and what is left unexplained."""
     used: list[str]
     """The photographs that show the board."""
     without: list[str]
     """Those that do not."""
+
+    def save(self, path: Path, board: Board) -> None:
+        """Write the camera as `Camera.save` does, with notes on how it was calibrated. That of a camera on the hand is
+        read by `Camera.load` with the hand's pose."""
+        notes = {"board": str(board), "square_size": board.square, "nframes": len(self.used)}
+        if self.eye_in_hand:
+            rotation, position = np.asarray(self.camera.rotation, float), np.asarray(self.camera.position, float)
+            notes |= {"hand_rotation": rotation, "hand_position": position.reshape(3, 1)}
+        self.camera.replace(has_extrinsics=not self.eye_in_hand).save(path, notes)
 
 
 def from_hand(
@@ -60,51 +93,81 @@ def from_hand(
     hands: Sequence[np.ndarray],
     paths: Sequence[Path],
     board: Board,
-    on_hand: bool,
-    progress: Callable[[int, str], None] = lambda *_: None,
-) -> FromHand:
-    """The camera with its pose, from photographs of a board, each with the pose (4, 4) of the hand in the base frame.
-    Either the camera is on the hand and the board stands still, or the camera stands and the hand holds the board.
+    eye_in_hand: bool,
+    progress: Callable[[int, str], object] | None = None,
+) -> HandEyeCalibration:
+    """Find a camera's pose from photographs of a board at several poses of the hand.
 
-    `progress` is told how many photographs have been looked at. Raises `UserError` if they do not determine the pose,
-    contradict each other, or do not fit the camera's intrinsics."""
+    Args:
+        camera: The calibrated camera.
+        hands: The hand's poses in the base frame, (4, 4) each, metres.
+        paths: The photographs that were taken there.
+        board: What they show.
+        eye_in_hand: Whether the camera is on the hand and the board stands still; otherwise the camera stands still and
+            the hand holds the board.
+        progress: Is told how many photographs have been looked at, and the name of the last.
+
+    Returns:
+        The camera's pose in the hand's frame or the base frame, and how well it is known.
+
+    Raises:
+        UserError: The photographs do not determine the pose, contradict each other, do not fit the camera's
+            intrinsics, or cannot be read.
+        OSError: They cannot be read.
+    """
     seen: dict[str, tuple[np.ndarray, Corners]] = {}
-    labels = names(paths)
-    for i, (hand, path, label) in enumerate(zip(hands, paths, labels, strict=True)):
+    names = image_names(paths)
+    for i, (hand, path, name) in enumerate(zip(hands, paths, names, strict=True)):
         corners = find(camera, path, board)
         if corners is not None:
-            seen[label] = hand, corners
-        progress(i + 1, label)
-    solve = eye_in_hand if on_hand else eye_to_hand
+            seen[name] = hand, corners
+        if progress is not None:
+            progress(i + 1, name)
+    solve = hand_eye.eye_in_hand if eye_in_hand else hand_eye.eye_to_hand
     poses = [hand for hand, _ in seen.values()]
 
-    def hand_eye(camera: Camera) -> HandEye:
+    def solve_for(camera: Camera) -> HandEye:
         return solve(poses, [board_pose(camera, corners) for _, corners in seen.values()])
 
-    result = hand_eye(camera)
-    return FromHand(
-        uncertainty.with_pose(camera, lambda c: hand_eye(c).camera, result.covariance),
+    result = solve_for(camera)
+    return HandEyeCalibration(
+        add_pose(camera, lambda c: solve_for(c).camera, result.covariance),
+        eye_in_hand,
         result,
         list(seen),
-        [label for label in labels if label not in seen],
+        [name for name in names if name not in seen],
     )
 
 
 def find(camera: Camera, path: Path, board: Board) -> Corners | None:
-    """The board's corners in a photograph; None if it is not seen. Raises `UserError` if the board leaves its own pose
-    open or the photograph is not of this camera."""
-    if board.turns:
+    """Find a board in a photograph of a calibrated camera.
+
+    Args:
+        camera: The camera.
+        path: The photograph.
+        board: What it shows.
+
+    Returns:
+        Its corners; None if it is not seen.
+
+    Raises:
+        UserError: The board leaves its own pose open, or the photograph is not of this camera or cannot be read.
+        OSError: It cannot be read.
+    """
+    if board.is_ambiguous:
         raise UserError(
             f"the {board} looks the same after half a turn: take one with an odd and an even number of corners, or a "
             "ChArUco board"
         )
-    grey = read_grey(path)
-    if grey.shape != (camera.height, camera.width):
+    gray = read_gray(path)
+    if gray.shape != (camera.height, camera.width):
         raise UserError(
-            f"{path} has {grey.shape[1]}x{grey.shape[0]} pixels and the camera {camera.width}x{camera.height}: take it "
+            f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels and the camera {camera.width}x{camera.height}: take it "
             "as the calibration's photographs were taken"
         )
-    corners = board.find(grey)
+    corners = board.find(gray)
     if corners is not None and (error := board_error(camera, corners)) > MAX_ERROR:
-        raise UserError(f"{path}: the board is off by {error:.1f} pixels: is this the camera that was calibrated?")
+        raise UserError(
+            f"{path}: the board has an error of {error:.1f} pixels: is this the camera that was calibrated?"
+        )
     return corners

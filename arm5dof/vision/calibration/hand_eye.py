@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision.calibration.poses import pose_matrix
 
 MIN_POSES = 4
 """Three determine the solution and leave nothing to tell its error by."""
@@ -60,34 +61,52 @@ class HandEye:
 def eye_in_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> HandEye:
     """A camera on the hand looks at a board that stands still.
 
-    `hands` are the hand's poses in the base frame and `boards` the board's poses in the camera's frame at the same
-    moments, (n, 4, 4) each. Raises `UserError` if they do not determine the answer or contradict each other.
+    Args:
+        hands: The hand's poses in the base frame, (n, 4, 4), metres.
+        boards: The board's poses in the camera's frame at the same moments, (n, 4, 4), metres.
+
+    Returns:
+        The camera's pose in the hand's frame and the board's in the base frame.
+
+    Raises:
+        UserError: The poses are not such, do not determine the answer, or contradict each other.
     """
     return _solve(_poses("hand", hands), _poses("board", boards))
 
 
 def eye_to_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> HandEye:
-    """A camera that stands still looks at a board on the hand; arguments as for `eye_in_hand`."""
+    """A camera that stands still looks at a board on the hand.
+
+    Args:
+        hands: As for `eye_in_hand`.
+        boards: As for `eye_in_hand`.
+
+    Returns:
+        The camera's pose in the base frame and the board's in the hand's frame.
+
+    Raises:
+        UserError: As for `eye_in_hand`.
+    """
     return _solve(_inverse(_poses("hand", hands)), _poses("board", boards))
 
 
 def _solve(robot: np.ndarray, boards: np.ndarray) -> HandEye:
     """The poses X and Z with robot_i X boards_i = Z for all i, as well as that can be."""
     if len(robot) != len(boards):
-        raise UserError(f"{len(robot)} poses of the hand and {len(boards)} of the board: give one of each per picture")
+        raise UserError(f"{len(robot)} poses of the hand and {len(boards)} of the board: give one of each per image")
     if len(robot) < MIN_POSES:
         raise UserError(f"{len(robot)} poses: hand-eye calibration takes {MIN_POSES} at least, better 15")
     _check_motion(robot)
     x, z = _closed_form(robot, boards)
     weights = np.repeat([1 / np.deg2rad(ROTATION_NOISE_DEG), 1 / TRANSLATION_NOISE_M], 3)
     for _ in range(STEPS):
-        residual, jacobian = _linearise(robot, boards, x, z)
+        residual, jacobian = _linearize(robot, boards, x, z)
         system, right = jacobian * weights[:, None], residual * weights
         step = np.linalg.lstsq(system.reshape(-1, 12), -right.reshape(-1), rcond=None)[0]
         x, z = _moved(x, step[:6]), _moved(z, step[6:])
         if np.abs(step).max() < 1e-12:
             break
-    residual, jacobian = _linearise(robot, boards, x, z)
+    residual, jacobian = _linearize(robot, boards, x, z)
     rotation, translation = (float(np.sqrt(np.square(part).mean())) for part in np.split(residual, 2, axis=1))
     if rotation > np.deg2rad(CONTRADICTION * ROTATION_NOISE_DEG) or translation > CONTRADICTION * TRANSLATION_NOISE_M:
         raise UserError(
@@ -109,20 +128,20 @@ def _closed_form(robot: np.ndarray, boards: np.ndarray) -> tuple[np.ndarray, np.
     """X and Z by Shah's method. For all i vec(R_X) = (R_Bi kron R_Ai^T) vec(R_Z), so both are singular vectors of the
     mean of those products."""
     mean = np.mean([np.kron(b[:3, :3], a[:3, :3].T) for a, b in zip(robot, boards, strict=True)], axis=0)
-    left, _, right = np.linalg.svd(mean)
+    left, _, right_t = np.linalg.svd(mean)
     x, z = np.eye(4), np.eye(4)
     sign = np.sign(np.linalg.det(left[:, 0].reshape(3, 3)))
     x[:3, :3] = _nearest_rotation(sign * left[:, 0].reshape(3, 3).T)
-    z[:3, :3] = _nearest_rotation(sign * right[0].reshape(3, 3).T)
+    z[:3, :3] = _nearest_rotation(sign * right_t[0].reshape(3, 3).T)
     # R_A (R_X t_B + t_X) + t_A = t_Z is linear in t_X and t_Z.
     system = np.concatenate([np.concatenate([a[:3, :3], -np.eye(3)], axis=1) for a in robot])
-    known = [-a[:3, 3] - a[:3, :3] @ x[:3, :3] @ b[:3, 3] for a, b in zip(robot, boards, strict=True)]
-    shifts = np.linalg.lstsq(system, np.concatenate(known), rcond=None)[0]
+    right = [-a[:3, 3] - a[:3, :3] @ x[:3, :3] @ b[:3, 3] for a, b in zip(robot, boards, strict=True)]
+    shifts = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
     x[:3, 3], z[:3, 3] = shifts[:3], shifts[3:]
     return x, z
 
 
-def _linearise(robot: np.ndarray, boards: np.ndarray, x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _linearize(robot: np.ndarray, boards: np.ndarray, x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What separates the boards' measured poses from those that X and Z explain, (n, 6), rotation vector and metres
     in the camera's frame; and its derivative, (n, 6, 12), by the moves of X and Z that `_moved` makes."""
     explained = _inverse(robot @ x) @ z
@@ -139,9 +158,7 @@ def _linearise(robot: np.ndarray, boards: np.ndarray, x: np.ndarray, z: np.ndarr
 
 def _moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
     """A pose after a small move (6,), rotation vector and metres, in its own frame."""
-    move = np.eye(4)
-    move[:3, :3], move[:3, 3] = cv2.Rodrigues(step[:3])[0], step[3:]
-    return pose @ move
+    return pose @ pose_matrix(cv2.Rodrigues(step[:3])[0], step[3:])
 
 
 def _check_motion(robot: np.ndarray) -> None:

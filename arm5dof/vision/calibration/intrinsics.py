@@ -7,31 +7,26 @@ different views it rests on.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.vision import images
-from arm5dof.vision.calibration import covariance as uncertainty
 from arm5dof.vision.calibration.boards import Board, Corners
+from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
+from arm5dof.vision.calibration.views import MIN_VIEWS, BoardView, BoardViews, board_error, board_pose
 from arm5dof.vision.camera import Camera
 
-MIN_VIEWS = 5
-"""Different views that a calibration takes. OpenCV's 13 photographs give the focal length to 0.1 % from any five of
-them, and to between 0.1 and 2 % from two or three."""
-
 SAME_VIEW = 0.02
-"""Views whose corners are closer than this share of the picture's diagonal, on average, are one view."""
+"""Views whose corners are closer than this share of the image's diagonal, on average, are one view."""
 
 MAX_DEVIATION = 0.005
 """The largest standard deviation of a focal length that is accepted, as a share of it; and of the principal point, as
-a share of the picture's larger side."""
+a share of the image's larger side."""
 
 OUTLIER = 3.0
 """A view whose error under the others' calibration is so many times their median is not of the same camera, or has
@@ -48,28 +43,12 @@ COUNT_FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
 """OpenCV's flags for so many distortion coefficients."""
 
 
-class View(NamedTuple):
-    """A board in a photograph."""
-
-    name: str
-    corners: Corners
-
-
-class Views(NamedTuple):
-    """What was found in a set of photographs."""
-
-    found: list[View]
-    without: list[str]
-    """Names of the photographs in which the board was not found."""
-    size: tuple[int, int]
-    """Width and height of every photograph."""
-
-
 @dataclass(frozen=True)
 class Calibration:
-    """A camera without a pose, and how well it is known."""
+    """What a calibration found."""
 
     camera: Camera
+    """Without extrinsics; with the covariance of its intrinsics."""
     rms: float
     """Root mean square of the reprojection error, pixels."""
     deviations: np.ndarray
@@ -85,47 +64,40 @@ class Calibration:
         matrix = np.asarray(self.camera.matrix)
         return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.asarray(self.camera.distortion)])
 
-
-def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str], None] = lambda *_: None) -> Views:
-    """Look for the board in photographs. `progress` is told how many are done. Raises `UserError` if photographs
-    cannot be read or differ in size, if too few show the board, or if they show a larger one."""
-    sizes: dict[str, tuple[int, int]] = {}
-    found, without, notes = [], [], []
-    for i, (path, name) in enumerate(zip(paths, names(paths), strict=True)):
-        grey = read_grey(path)
-        sizes[name] = grey.shape[1], grey.shape[0]
-        corners = board.find(grey)
-        notes.append(board.inspect(grey, corners))
-        if corners is None:
-            without.append(name)
-        else:
-            found.append(View(name, corners))
-        progress(i + 1, name)
-    size = _one_size(sizes)
-    mismatch = board.mismatch(notes)
-    if mismatch is not None:
-        raise UserError(f"{len(found)} of {len(paths)} photographs show the {board}; {mismatch}")
-    if len(found) < MIN_VIEWS:
-        hint = "; in the others it is not seen whole, with a white margin and in focus" if without else ""
-        raise UserError(
-            f"{len(found)} of {len(paths)} photographs show the {board} and a calibration takes {MIN_VIEWS}, from "
-            f"different sides, tilted, near and far{hint}"
-        )
-    return Views(found, without, size)
+    def save(self, path: Path, board: Board) -> None:
+        """Write the camera as `Camera.save` does, with notes on how it was calibrated."""
+        notes = {
+            "nframes": len(self.errors),
+            "board": str(board),
+            "square_size": board.square,
+            "avg_reprojection_error": self.rms,
+            "intrinsics_standard_deviations": self.deviations.reshape(-1, 1),
+        }
+        self.camera.save(path, notes)
 
 
-def calibrate(views: Views, coefficients: int = 5) -> Calibration:
-    """Calibrate, leaving out views that do not fit the others. Raises `UserError` if the views are too few, too much
-    alike or too contradictory to tell the camera's intrinsics."""
+def calibrate(views: BoardViews, coefficients: int = 5) -> Calibration:
+    """Calibrate a camera, leaving out views that do not fit the others.
+
+    Args:
+        views: What `find_views` found.
+        coefficients: How many distortion coefficients to estimate: 4, 5, or 8 for wide lenses.
+
+    Returns:
+        The camera without extrinsics, and how well it is known.
+
+    Raises:
+        UserError: The views are too few, too much alike or too contradictory to tell the camera's intrinsics.
+    """
     kept, outliers = list(views.found), []
     result = fit(kept, views.size, coefficients)
     while len(kept) > MIN_VIEWS:
         worst = max(kept, key=lambda view: result.errors[view.name])
-        rest = [view for view in kept if view is not worst]
-        without = fit(rest, views.size, coefficients)
+        others = [view for view in kept if view is not worst]
+        without = fit(others, views.size, coefficients)
         if board_error(without.camera, worst.corners) <= OUTLIER * float(np.median(list(without.errors.values()))):
             break
-        kept, result = rest, without
+        kept, result = others, without
         outliers.append(worst)
     if 4 * len(outliers) > len(views.found):
         listed = ", ".join(view.name for view in outliers)
@@ -137,12 +109,22 @@ def calibrate(views: Views, coefficients: int = 5) -> Calibration:
     _check_agreement(kept, result)
     _check_deviations(result)
     seen = [view.corners for view in kept]
-    camera = uncertainty.with_intrinsics(result.camera, seen, [board_pose(result.camera, corners) for corners in seen])
+    camera = add_intrinsics_covariance(result.camera, seen, [board_pose(result.camera, corners) for corners in seen])
     return replace(result, camera=camera, outliers={view.name: board_error(camera, view.corners) for view in outliers})
 
 
-def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, flags: int = 0) -> Calibration:
-    """OpenCV's calibration of these views as they are, whatever they are worth. `flags` are OpenCV's."""
+def fit(views: Sequence[BoardView], size: tuple[int, int], coefficients: int = 5, flags: int = 0) -> Calibration:
+    """OpenCV's calibration of these views as they are, whatever they are worth.
+
+    Args:
+        views: A board in several photographs.
+        size: Width and height of the photographs, pixels.
+        coefficients: How many distortion coefficients to estimate: 4, 5 or 8.
+        flags: OpenCV's, besides those.
+
+    Returns:
+        The camera without extrinsics and without a covariance; no outliers.
+    """
     start = np.eye(3) if flags & cv2.CALIB_FIX_ASPECT_RATIO else None  # The ratio that is to be kept.
     rms, matrix, distortion, _, _, deviations, _, errors = cv2.calibrateCameraExtended(  # type: ignore[call-overload]
         [view.corners.points for view in views],
@@ -153,7 +135,7 @@ def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, fla
         flags=flags | COUNT_FLAGS[coefficients],
     )
     return Calibration(
-        Camera(matrix, distortion.ravel()[:coefficients], np.eye(3), np.zeros(3), *size, posed=False),
+        Camera(matrix, distortion.ravel()[:coefficients], np.eye(3), np.zeros(3), *size, has_extrinsics=False),
         float(rms),
         deviations.ravel()[: 4 + coefficients],
         {view.name: float(error) for view, error in zip(views, errors.ravel(), strict=True)},
@@ -161,37 +143,23 @@ def fit(views: Sequence[View], size: tuple[int, int], coefficients: int = 5, fla
     )
 
 
-def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
-    """The board's pose in the camera's frame, (4, 4), from one photograph."""
-    lens = _lens(camera)
-    # A flat board has two poses that look alike; the first is the one with the smaller error.
-    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, corners.pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
-    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, *lens, turns[0], shifts[0])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return pose
-
-
 def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
-    """A photograph as it is and, beside it, without its lens distortion, as an image file of the kind `suffix`."""
-    picture = cv2.cvtColor(images.read(path), cv2.COLOR_RGB2BGR)
-    straight = cv2.undistort(picture, *_lens(camera))
-    return cv2.imencode(suffix, np.concatenate([picture, straight], axis=1))[1].tobytes()
+    """Show what a calibration does to a photograph.
+
+    Args:
+        path: The photograph.
+        camera: What took it.
+        suffix: Of an image file, such as `.png`.
+
+    Returns:
+        The content of such a file: the photograph as it is and, beside it, without its lens distortion.
+    """
+    image = cv2.cvtColor(images.read(path), cv2.COLOR_RGB2BGR)
+    straight = cv2.undistort(image, *camera.opencv)
+    return cv2.imencode(suffix, np.concatenate([image, straight], axis=1))[1].tobytes()
 
 
-def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(camera.matrix, float), np.asarray(camera.distortion, float)
-
-
-def board_error(camera: Camera, corners: Corners) -> float:
-    """Root mean square reprojection error of a view with the best pose, pixels."""
-    pose = board_pose(camera, corners)
-    turn, _ = cv2.Rodrigues(pose[:3, :3])
-    pixels, _ = cv2.projectPoints(corners.points, turn, pose[:3, 3], *_lens(camera))
-    return float(np.sqrt(np.square(pixels[:, 0] - corners.pixels).sum(-1).mean()))
-
-
-def _check_different(views: Sequence[View], size: tuple[int, int]) -> None:
+def _check_different(views: Sequence[BoardView], size: tuple[int, int]) -> None:
     """Count views that are not repetitions of an earlier one."""
     different: list[Corners] = []
     for view in views:
@@ -200,12 +168,12 @@ def _check_different(views: Sequence[View], size: tuple[int, int]) -> None:
     if len(different) < MIN_VIEWS:
         raise UserError(
             f"only {len(different)} of {len(views)} views differ and a calibration takes {MIN_VIEWS}: photograph the "
-            "board from different sides and distances, tilted, all over the picture"
+            "board from different sides and distances, tilted, all over the image"
         )
 
 
 def _apart(a: Corners, b: Corners) -> float:
-    """Mean distance in the picture between the corners that two views share, pixels; infinite if they share none."""
+    """Mean distance in the image between the corners that two views share, pixels; infinite if they share none."""
     places = {tuple(point): pixel for point, pixel in zip(b.points, b.pixels, strict=True)}
     apart = [
         np.linalg.norm(pixel - places[key])
@@ -215,15 +183,14 @@ def _apart(a: Corners, b: Corners) -> float:
     return float(np.mean(apart)) if apart else np.inf
 
 
-def _check_agreement(views: Sequence[View], result: Calibration) -> None:
+def _check_agreement(views: Sequence[BoardView], result: Calibration) -> None:
     """Compare the error with that of views calibrated one by one, where they have corners enough for that."""
-    matrix, distortion = _lens(result.camera)
+    matrix, distortion = result.camera.opencv
     flags = COUNT_FLAGS[len(distortion)] | cv2.CALIB_USE_INTRINSIC_GUESS
     together, alone = [], []
     for name, (points, pixels) in views:
-        spare = (
-            1 - (10 + len(distortion)) / pixels.size
-        )  # Fitted are the pose, two focal lengths, the centre, the lens.
+        # Fitted are the pose, two focal lengths, the principal point, the lens.
+        spare = 1 - (10 + len(distortion)) / pixels.size
         if spare > 0.5:
             size = result.camera.width, result.camera.height
             rms, *_ = cv2.calibrateCamera([points], [pixels], size, matrix.copy(), distortion.copy(), flags=flags)
@@ -246,29 +213,3 @@ def _check_deviations(result: Calibration) -> None:
                 f"{name} = {value:.1f} +- {deviation:.1f} pixels (standard deviation) and {limit:.1f} is the limit: "
                 "add photographs with the board tilted by 30 to 45 degrees, near, and at the corners"
             )
-
-
-def _one_size(sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
-    (size, _), *more = Counter(sizes.values()).most_common()
-    if more:
-        others = [f"{name} ({w}x{h})" for name, (w, h) in sizes.items() if (w, h) != size]
-        raise UserError(
-            f"the photographs differ in size: most have {size[0]}x{size[1]} pixels, but not {', '.join(others[:10])}; "
-            "leave those out, or calibrate each size by itself"
-        )
-    return size
-
-
-def names(paths: Sequence[Path]) -> list[str]:
-    """File names, with their folders where two are the same."""
-    count = Counter(path.name for path in paths)
-    return [path.name if count[path.name] == 1 else str(path) for path in paths]
-
-
-def read_grey(path: Path) -> np.ndarray:
-    """A photograph in grey, (h, w), uint8."""
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
-    if picture is None:
-        raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
-    return picture

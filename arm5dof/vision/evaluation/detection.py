@@ -17,7 +17,13 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision.detections import Detections, Detector
 from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
-from arm5dof.vision.evaluation.localization import Accuracy, Tally, edge_errors, place, render_stereo_sample
+from arm5dof.vision.evaluation.localization import (
+    Accuracy,
+    Tally,
+    edge_errors,
+    locate_by_each,
+    render_stereo_sample,
+)
 from arm5dof.vision.objects import CLASS_NAMES
 from arm5dof.vision.rendering.simulated import BackEnd
 from arm5dof.vision.synthetic.ground_truth import Truth
@@ -103,14 +109,14 @@ def evaluate(
     samples = parallel_map(partial(render_stereo_sample, seed=seed, back_end=back_end), scenes)
     for done, sample in enumerate(samples, 1):
         first = sample.views[0]
-        both = [permissive(view.picture) for view in sample.views]
+        both = [permissive(view.image) for view in sample.views]
         truths.append(first.truth)
         detections.append(both[0])
         confident = [found[found.confidence >= POSITION_CONFIDENCE] for found in both]
         errors.append(edge_errors(confident[0], first.truth))
-        for method, located in place(sample, confident).items():
+        for method, located in locate_by_each(sample, confident).items():
             tallies[method].add(located, first.truth)
-        images += [first.picture] * (done <= TIMED_IMAGES)
+        images += [first.image] * (done <= TIMED_IMAGES)
         progress(done)
     positions = {method: tally.accuracy() for method, tally in tallies.items()}
     edge_px = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))

@@ -21,7 +21,7 @@ import numpy as np
 
 from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 from arm5dof.vision.detectors.yolov5.layers import Conv
-from arm5dof.vision.evaluation.localization import pairs
+from arm5dof.vision.evaluation.localization import match_truth
 from arm5dof.vision.rendering import opengl
 from arm5dof.vision.rendering.software import SoftwareRenderer
 from arm5dof.vision.synthetic.samples import render_sample
@@ -113,7 +113,7 @@ def _tabletop() -> Finding:
     detector = TabletopDetector()
     samples = [render_sample(number, 0, "evaluation", "software") for number in range(SCENES)]
     present = sum(int(sample.truth.counts.sum()) for sample in samples)
-    found = sum(len(pairs(detector(sample.image), sample.truth)[0]) for sample in samples)
+    found = sum(len(match_truth(detector(sample.image), sample.truth)[0]) for sample in samples)
     ms = _milliseconds(lambda: detector(samples[0].image))
     detail = f"found {found} of {present} objects in {SCENES} simulated images, {ms:.1f} ms an image of 640 x 480"
     works = 2 * found > present

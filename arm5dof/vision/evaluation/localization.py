@@ -1,4 +1,4 @@
-"""How well things are placed in random scenes: by the detector's own boxes, and cameras known only as well as
+"""How well objects are located in random scenes: by the detector's own boxes, and cameras known only as well as
 calibration makes them known."""
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ import numpy as np
 from arm5dof.vision.boxes import iou
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.evaluation.simulated_calibration import rehearse
-from arm5dof.vision.localization.depth import by_depth
-from arm5dof.vision.localization.locate import Located, by_plane
-from arm5dof.vision.localization.multi_view import by_views
+from arm5dof.vision.evaluation.simulated_calibration import simulate_calibration
+from arm5dof.vision.localization import locate
+from arm5dof.vision.localization.common import Localization
 from arm5dof.vision.localization.solids import CATALOGUE_SOLIDS, Solid
 from arm5dof.vision.rendering.simulated import BackEnd, simulated_camera
 from arm5dof.vision.synthetic.ground_truth import Truth, truth
@@ -22,113 +21,141 @@ from arm5dof.vision.synthetic.samples import HEIGHT, WIDTH
 from arm5dof.vision.synthetic.scene_builder import CAMERA, SECOND
 from arm5dof.vision.synthetic.scenes import random_scene
 
-EDGES = 0.9
+BOX_STD = 0.9
 """What is said of the edges of the detector's boxes, as a standard deviation, pixels. Most are nearer, as if it were
-0.8; with those round half-hidden things it is 1.2."""
-SHARED, NOISE = 2e-3, 2e-3
-"""Standard deviations of what depth images are off by, as a whole and in each pixel, metres."""
+0.8; with those round half-hidden objects it is 1.2."""
+DEPTH_STD, PIXEL_STD = 2e-3, 2e-3
+"""Standard deviations of the errors of depth images, as a whole and in each pixel, metres."""
 LEVELS = {"68": 3.5267, "95": 7.8147}
 """Squares of how many standard deviations hold so many per cent of positions in space."""
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraSample:
     """What one camera sees of a scene."""
 
-    picture: np.ndarray
+    image: np.ndarray
     """RGB uint8 (h, w, 3)."""
     depth: np.ndarray
-    """As a depth camera would measure it, (h, w), metres."""
+    """As a depth camera would measure it, (h, w) float32, metres."""
     truth: Truth
-    known: Camera
+    calibrated: Camera
     """The camera as its calibration has it."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Of one method of placing things."""
+    """Of one way to locate objects."""
 
     median_mm: float
-    """Of distances in space from the true middles."""
+    """Of distances in space from the true centers."""
     p95_mm: float
+    """Their 95th percentile."""
     placed: float
-    """Which share of the things that count has a position."""
+    """Which share of the objects that count has a position."""
     covered: dict[str, float]
-    """Per cent of true positions inside the ellipsoids that should hold 68 and 95 of 100."""
+    """Per cent of true positions inside the ellipsoids that should hold 68 % and 95 % of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoSample:
-    """A scene seen by two cameras, and how high its things are taken to be: heights vary, as things do."""
+    """A scene seen by two cameras, and how high its objects are taken to be: heights vary, as objects do."""
 
-    views: tuple[View, View]
+    views: tuple[CameraSample, CameraSample]
     solids: dict[str, Solid]
 
 
 def render_stereo_sample(number: int, seed: int, back_end: BackEnd) -> StereoSample:
-    """The scene of that number in a series, in the style of evaluation."""
+    """Draw a random scene in the style of evaluation.
+
+    Args:
+        number: Of the scene in a series.
+        seed: Of the series.
+        back_end: What draws.
+
+    Returns:
+        What two cameras see of it.
+    """
     scene = random_scene((seed, number), "evaluation")
     rng = np.random.default_rng((seed, number))
     views = []
     for name in (CAMERA, SECOND):
         camera = simulated_camera(scene.model, name, WIDTH, HEIGHT, back_end)
         true = Camera.from_mujoco(scene.model, name, WIDTH, HEIGHT, scene.data)
-        depth = camera.depth(scene.data) + SHARED * rng.normal() + NOISE * rng.normal(size=(HEIGHT, WIDTH))
+        depth = camera.depth(scene.data) + DEPTH_STD * rng.normal() + PIXEL_STD * rng.normal(size=(HEIGHT, WIDTH))
         there = truth(scene, camera.segmentation(scene.data), name)
-        views.append(View(camera.rgb(scene.data), depth.astype(np.float32), there, rehearse(true, rng)))
+        calibrated = simulate_calibration(true, rng)
+        views.append(CameraSample(camera.rgb(scene.data), depth.astype(np.float32), there, calibrated))
     solids = {
-        name: replace(solid, half_height=solid.half_height + solid.deviation * rng.normal())
+        name: replace(solid, half_height=solid.half_height + solid.std * rng.normal())
         for name, solid in CATALOGUE_SOLIDS.items()
     }
     return StereoSample((views[0], views[1]), solids)
 
 
-def place(seen: StereoSample, found: Sequence[Detections]) -> dict[str, Located]:
-    """Where the things found in both pictures are, by each method."""
-    first, second = seen.views
-    given = found[0], first.known, seen.solids
+def locate_by_each(sample: StereoSample, found: Sequence[Detections]) -> dict[str, Localization]:
+    """Locate what was found in both images, in each of the three ways.
+
+    Args:
+        sample: The scene.
+        found: The detections in each of its images.
+
+    Returns:
+        Where the objects are by `plane` and `depth`, from the first image, and by `two_views`.
+    """
+    first, second = sample.views
+    cameras = (first.calibrated, second.calibrated)
     return {
-        "plane": by_plane(*given, pixels=EDGES),
-        "depth": by_depth(found[0], first.depth, *given[1:], pixels=EDGES, deviation=SHARED),
-        "two_views": by_views(found, (first.known, second.known), seen.solids, pixels=EDGES),
+        "plane": locate(found[0], first.calibrated, sample.solids, box_std=BOX_STD),
+        "depth": locate(
+            found[0], first.calibrated, sample.solids, depth=first.depth, box_std=BOX_STD, depth_std=DEPTH_STD
+        ),
+        "two_views": locate(found, cameras, sample.solids, box_std=BOX_STD),
     }
 
 
-def pairs(found: Detections, there: Truth) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the things that count and were found, and of the boxes that found them, (n,) each. A thing is found by
-    the box of its class that fits it best, if by half at least."""
+def match_truth(found: Detections, there: Truth) -> tuple[np.ndarray, np.ndarray]:
+    """Which objects were found. An object is found by the box of its class that fits it best, if by half at least.
+
+    Args:
+        found: Detections in an image.
+        there: What there is to find in it.
+
+    Returns:
+        Rows of the objects that count and were found, and of the boxes that found them, (n,) int each.
+    """
     fit = np.where(there.class_id[:, None] == found.class_id, iou(there.xyxy[:, None], found.xyxy), 0.0)
-    things = np.flatnonzero(there.counts & (fit.max(1, initial=0) >= 0.5))
-    return things, fit[things].argmax(1) if len(things) else things
+    objects = np.flatnonzero(there.counts & (fit.max(1, initial=0) >= 0.5))
+    return objects, fit[objects].argmax(1) if len(objects) else objects
 
 
 def edge_errors(found: Detections, there: Truth) -> np.ndarray:
-    """How far the edges of boxes are off, (n, 4), pixels."""
-    things, boxes = pairs(found, there)
-    return found.xyxy[boxes] - there.xyxy[things]
+    """Errors of the edges of the boxes that found an object, (n, 4), pixels."""
+    objects, boxes = match_truth(found, there)
+    return found.xyxy[boxes] - there.xyxy[objects]
 
 
 class Tally:
-    """Collects what one method says of the things in many scenes."""
+    """Collects what one way to locate says of the objects in many scenes."""
 
     def __init__(self) -> None:
-        self._things = 0
-        self._off: list[float] = []
+        self._count = 0
+        self._errors: list[float] = []
         self._squares: list[float] = []
 
-    def add(self, located: Located, there: Truth) -> None:
-        """Of one scene."""
-        things, boxes = pairs(located.detections, there)
-        self._things += int(there.counts.sum())
-        for i, j in zip(things, boxes, strict=True):
-            if not located.reasons[j]:
-                off = located.position[j] - there.position[i]
-                self._off.append(float(np.linalg.norm(off)))
-                self._squares.append(float(off @ np.linalg.solve(located.covariance[j], off)))
+    def add(self, located: Localization, there: Truth) -> None:
+        """Add one scene."""
+        objects, boxes = match_truth(located.detections, there)
+        self._count += int(there.counts.sum())
+        for i, j in zip(objects, boxes, strict=True):
+            if not located.failure[j]:
+                error = located.position[j] - there.position[i]
+                self._errors.append(float(np.linalg.norm(error)))
+                self._squares.append(float(error @ np.linalg.solve(located.covariance[j], error)))
 
     def accuracy(self) -> Accuracy:
         """Of all scenes."""
-        off, squares = np.array(self._off or [np.nan]), np.array(self._squares or [np.nan])
-        median, p95 = np.percentile(off, [50, 95]) * 1e3
+        errors, squares = np.array(self._errors or [np.nan]), np.array(self._squares or [np.nan])
+        median, p95 = np.percentile(errors, [50, 95]) * 1e3
         covered = {name: 100 * float(np.mean(squares <= level)) for name, level in LEVELS.items()}
-        return Accuracy(float(median), float(p95), len(self._off) / max(self._things, 1), covered)
+        return Accuracy(float(median), float(p95), len(self._errors) / max(self._count, 1), covered)

@@ -16,8 +16,16 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
 def annotate(image: np.ndarray, detections: Detections, labels: Sequence[str] | None = None) -> np.ndarray:
-    """A copy of an RGB uint8 image (h, w, 3) with the boxes drawn in, the most confident on top, and labelled; without
-    labels, with their classes and confidences."""
+    """Draw boxes and labels, the most confident on top.
+
+    Args:
+        image: RGB uint8, (h, w, 3).
+        detections: The boxes; they may lie outside the image.
+        labels: One for each box; without them, its class and confidence.
+
+    Returns:
+        A new image of the same kind.
+    """
     if labels is None:
         each = zip(detections.data["class_name"], detections.confidence, strict=True)
         labels = [f"{name} {confidence:.2f}" for name, confidence in each]
@@ -31,7 +39,7 @@ def annotate(image: np.ndarray, detections: Detections, labels: Sequence[str] | 
             int(v) for v in np.round(np.clip(one.xyxy[0], -9 * line, max(image.shape) + 9 * line))
         )
         if left < width and top < height and right > 0 and bottom > 0:
-            # The rim keeps a box in sight before things of its own colour.
+            # The rim keeps a box in sight before what is of its own colour.
             for edge, thickness in ((ink(colour), line + 2), (colour, line)):
                 cv2.rectangle(image, (left, top), (right - 1, bottom - 1), edge, thickness)
             _label(image, label, (left, top), colour, line)

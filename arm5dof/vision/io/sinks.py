@@ -1,4 +1,4 @@
-"""Where detections go, or the places of things: a JSON list, a table, images or a video with the boxes drawn in.
+"""Where results go: a JSON list, a table, images or a video with the boxes drawn in.
 
 Each is a context that gives a function to call with every frame and what was found in it, in turn.
 """
@@ -21,20 +21,26 @@ from arm5dof.vision.detections import Detections
 from arm5dof.vision.frames import Frame
 from arm5dof.vision.io.annotate import annotate
 from arm5dof.vision.io.detections_file import as_json
-from arm5dof.vision.io.sources import IMAGE_SUFFIXES, USUAL_RATE, Source
+from arm5dof.vision.io.sources import DEFAULT_RATE, IMAGE_SUFFIXES, Source
 from arm5dof.vision.opencv import quiet
 
 Write = Callable[[Frame, Any], None]
+"""Takes a frame and what was found in it: detections, or their localization."""
 AsJSON = Callable[[Frame, Any], dict[str, Any]]
 Draw = Callable[[np.ndarray, Any], np.ndarray]
-"""Takes an RGB uint8 image (h, w, 3) and what was found in it."""
+"""Takes an RGB uint8 image (h, w, 3) and what was found in it; returns an image with that drawn in."""
 Show = Callable[[Frame, np.ndarray], None]
-"""Takes a frame and its picture with the boxes drawn in."""
+"""Takes a frame and its image with the boxes drawn in."""
 
 
 @contextmanager
 def json_list(stream: TextIO, as_json: AsJSON = as_json) -> Iterator[Write]:
-    """A JSON list with a frame in each line, so that a program can follow it and a person can read it."""
+    """A JSON list with a frame in each line, so that a program can follow it and a person can read it.
+
+    Args:
+        stream: Where it goes, frame by frame.
+        as_json: What to write of a frame and what was found in it.
+    """
     before = "[\n"
 
     def write(frame: Frame, found: Any) -> None:
@@ -50,8 +56,8 @@ def json_list(stream: TextIO, as_json: AsJSON = as_json) -> Iterator[Write]:
 
 
 @contextmanager
-def table(stream: TextIO) -> Iterator[Write]:
-    """For people: each frame and, below it, what was found."""
+def detection_table(stream: TextIO) -> Iterator[Write]:
+    """For people: each frame and, below it, its detections."""
     head = f"  {'class':16} conf     left      top    right   bottom\n"
 
     def write(frame: Frame, found: Detections) -> None:
@@ -73,7 +79,18 @@ def folder(
     path: Path, source: Source, list_name: str = "detections.json", as_json: AsJSON = as_json, draw: Draw = annotate
 ) -> Iterator[Write]:
     """A folder with a JSON list and the frames with boxes drawn in: images named as the photographs are, or a video.
-    The folder appears when all is in it, and not at all if the block fails."""
+    The folder appears when all is in it, and not at all if the block fails.
+
+    Args:
+        path: The new folder.
+        source: Where the frames come from.
+        list_name: Of the file with the JSON list.
+        as_json: What to write into it of a frame and what was found in it.
+        draw: Draws that into the frame's image.
+
+    Raises:
+        UserError: The folder exists, or a video cannot be written.
+    """
     with ExitStack() as stack:
         temporary = stack.enter_context(files.making(path))
         text = stack.enter_context(open(temporary / list_name, "w", encoding="utf-8"))
@@ -90,12 +107,12 @@ def folder(
 def _images(into: Path) -> Show:
     """A file for each frame, in the format of the photograph that it was, or PNG. Two of a name get numbers."""
 
-    def show(frame: Frame, picture: np.ndarray) -> None:
+    def show(frame: Frame, image: np.ndarray) -> None:
         name = Path(frame.name).name
         wanted = into / (name if name.lower().endswith(IMAGE_SUFFIXES) else f"{name}.png")
         others = (wanted.with_stem(f"{wanted.stem}-{i}") for i in itertools.count(2))
         path = next(p for p in itertools.chain([wanted], others) if not p.exists())
-        _, content = cv2.imencode(path.suffix.lower(), picture[..., ::-1])
+        _, content = cv2.imencode(path.suffix.lower(), image[..., ::-1])
         path.write_bytes(content.tobytes())
 
     return show
@@ -104,7 +121,7 @@ def _images(into: Path) -> Show:
 @contextmanager
 def _video(into: Path, source: Source) -> Iterator[Show]:
     """An MP4 at the source's rate."""
-    video = _Video(into, source.rate or USUAL_RATE, source.live)
+    video = _Video(into, source.rate or DEFAULT_RATE, source.live)
     try:
         yield video.show
     finally:
@@ -121,16 +138,16 @@ class _Video:
         self._encoder = cv2.VideoWriter()
         self._written = 0
 
-    def show(self, frame: Frame, picture: np.ndarray) -> None:
+    def show(self, frame: Frame, image: np.ndarray) -> None:
         if not self._written:
-            self._open(Path(frame.name).stem, picture)
-        if picture.shape[1::-1] != self._size:  # The encoder would leave it out without a word.
-            picture = cv2.resize(picture, self._size)
+            self._open(Path(frame.name).stem, image)
+        if image.shape[1::-1] != self._size:  # The encoder would leave it out without a word.
+            image = cv2.resize(image, self._size)
         # A camera's frames come as fast as they are looked at; the video runs as fast as the clock did.
         due = round((frame.time or 0) * self._rate) + 1 if self._live else 0
         for _ in range(max(1, due - self._written)):
             with quiet():
-                self._encoder.write(picture[..., ::-1])
+                self._encoder.write(image[..., ::-1])
             self._written += 1
 
     def close(self) -> None:
@@ -144,8 +161,8 @@ class _Video:
             if capture.get(cv2.CAP_PROP_FRAME_COUNT) != self._written:
                 raise UserError("the annotated video could not be written whole: is the disk full?")
 
-    def _open(self, name: str, picture: np.ndarray) -> None:
-        self._path, self._size = self._into / f"{name}.mp4", picture.shape[1::-1]
+    def _open(self, name: str, image: np.ndarray) -> None:
+        self._path, self._size = self._into / f"{name}.mp4", image.shape[1::-1]
         with quiet():
             code = cv2.VideoWriter.fourcc(*"mp4v")
             self._encoder.open(str(self._path), cv2.CAP_FFMPEG, code, self._rate, self._size)

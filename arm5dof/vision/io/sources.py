@@ -21,18 +21,18 @@ from arm5dof.vision.opencv import quiet
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """What counts as a photograph in a folder; a file that is named may be called anything."""
 
-SCENES = 10
+DEFAULT_SCENES = 10
 """How many random scenes are drawn unless a number is given."""
 
-USUAL_RATE = 30.0
+DEFAULT_RATE = 30.0
 """Frames per second where a video or camera does not say."""
 
-TEXT = cv2.VideoWriter.fourcc(*"ansi")
+TEXT_CODEC = cv2.VideoWriter.fourcc(*"ansi")
 """What FFmpeg calls a text file, which it shows as if it were typed onto a screen."""
 
-MISSING_S = 0.5
+MAX_MISSING_S = 0.5
 """What may be missing at a video's end. What it states of its length is an estimate in some formats, and its sound may
-be a little longer than its pictures."""
+be a little longer than its images."""
 
 
 Frames = Generator[Frame, None, None]
@@ -47,23 +47,30 @@ class Source:
     length: int | None
     """How many there will be, as far as that is known."""
     rate: float | None = None
-    """Frames per second of a video or camera; None for photographs, which are of many sizes."""
+    """Frames per second of a video or camera; None for images by themselves, which may be of many sizes."""
     live: bool = False
     """A camera: its frames come when they come, and it goes on until somebody stops it."""
-    drawn: bool = False
-    """Random scenes: each frame brings its camera."""
+    has_cameras: bool = False
+    """Random scenes: each frame brings its camera, known exactly."""
 
 
 def open_source(given: Sequence[str]) -> Source:
-    """What a command line names: a camera by its number, `simulated` or `simulated:N` for random scenes, a video file,
-    or any number of photographs and folders.
+    """Open what is named.
 
-    Raises `UserError` if it is none of these, or several that do not go together.
+    Args:
+        given: The number of a camera, `simulated` or `simulated:N` for random scenes, a video file, or any number of
+            photographs and folders of them.
+
+    Returns:
+        Its frames, and what is known of them beforehand.
+
+    Raises:
+        UserError: It is none of these, or several that do not go together.
     """
     if len(given) == 1 and re.fullmatch(r"\d{1,3}", given[0]):
         return camera(int(given[0]))
     if len(given) == 1 and (match := re.fullmatch(r"simulated(?::(\d{1,6}))?", given[0])):
-        return simulated(int(match[1] or SCENES))
+        return simulated(int(match[1] or DEFAULT_SCENES))
     paths = [Path(text) for text in given]
     for path in paths:
         if not path.exists():
@@ -75,7 +82,17 @@ def open_source(given: Sequence[str]) -> Source:
 
 
 def image_files(given: Sequence[Path]) -> list[Path]:
-    """The photographs named, and those in the folders named, each once, in order."""
+    """Find photographs.
+
+    Args:
+        given: Files and folders.
+
+    Returns:
+        The files, and those in the folders whose suffix is one of `IMAGE_SUFFIXES`, each once, in order.
+
+    Raises:
+        UserError: There is no such file or folder, or a folder holds no images.
+    """
     found: dict[Path, None] = {}
     for path in given:
         if path.is_dir():
@@ -91,7 +108,7 @@ def image_files(given: Sequence[Path]) -> list[Path]:
 
 
 def photographs(paths: Sequence[Path]) -> Source:
-    """Image files."""
+    """Image files, one after another. The frames raise `UserError` at one that is no image."""
     return Source((Frame(str(path), images.read(path)) for path in paths), len(paths))
 
 
@@ -99,7 +116,7 @@ def video(path: Path) -> Source:
     """A video file. Raises `UserError` if it is none that FFmpeg reads; its frames do where it ends before its time."""
     with quiet():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    if not capture.isOpened() or int(capture.get(cv2.CAP_PROP_FOURCC)) == TEXT:
+    if not capture.isOpened() or int(capture.get(cv2.CAP_PROP_FOURCC)) == TEXT_CODEC:
         raise UserError(f"{path} is empty, damaged, or no image or video that OpenCV reads: give an MP4 or AVI file")
     rate = _rate(capture)
     stated = max(0, round(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
@@ -115,7 +132,7 @@ def video(path: Path) -> Source:
             capture.release()
         if end == 0:
             raise UserError(f"{path} is a video without a picture: it is damaged or cut short")
-        if end < stated / rate - MISSING_S:
+        if end < stated / rate - MAX_MISSING_S:
             raise UserError(f"{path} breaks off after {end:.1f} of {stated / rate:.1f} s: it is damaged or cut short")
 
     return Source(frames(), stated or None, rate)
@@ -144,14 +161,34 @@ def camera(index: int) -> Source:
 
 
 def simulated(count: int) -> Source:
-    """The first random scenes in the style of evaluation, 640 x 480. Raises `UserError` for none."""
+    """The first `count` random scenes in the style of evaluation, 640 x 480. Raises `UserError` for none."""
     if count < 1:
-        raise UserError("simulated:0 is no scene: ask for one or more")
+        raise UserError(f"{count} scenes are none: ask for one or more")
     from arm5dof.vision.synthetic.samples import render_sample  # MuJoCo takes its time to import.
 
     names = (f"scene{number}.png" for number in range(count))
     samples = ((name, render_sample(number, 0, "evaluation", "auto")) for number, name in enumerate(names))
-    return Source((Frame(name, one.image, camera=one.camera) for name, one in samples), count, drawn=True)
+    return Source((Frame(name, one.image, camera=one.camera) for name, one in samples), count, has_cameras=True)
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """Read a depth image as most depth cameras write it: one channel of 16 bits, in millimetres.
+
+    Args:
+        path: A PNG file.
+
+    Returns:
+        (h, w) float64, metres; zero where the depth is missing.
+
+    Raises:
+        UserError: It is no such image.
+        OSError: It cannot be read.
+    """
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise UserError(f"{path} is no depth image: give a PNG file with one channel of 16 bits, in millimetres")
+    return pixels / 1000
 
 
 def _is_video(path: Path) -> bool:
@@ -161,7 +198,7 @@ def _is_video(path: Path) -> bool:
 
 def _rate(capture: cv2.VideoCapture) -> float:
     rate = capture.get(cv2.CAP_PROP_FPS)
-    return rate if math.isfinite(rate) and rate > 0 else USUAL_RATE
+    return rate if math.isfinite(rate) and rate > 0 else DEFAULT_RATE
 
 
 def _next(capture: cv2.VideoCapture) -> np.ndarray | None:

@@ -1,15 +1,15 @@
-"""What must stand where, to be seen in these boxes: the arithmetic behind `locate`, one thing at a time.
+"""Which solid is seen in these boxes: the arithmetic behind `locate`, one object at a time.
 
-The middle of a box is not where the middle of the thing is seen: that is off by up to 3 mm for blocks and 13 mm for
-cones. So the box is explained rather than its middle cast back: where must a solid of the known height and form stand,
-and how wide must it be, for its box to have these four edges? Gauss-Newton steps find out, and the last of them carries
-the derivatives by all that went in, from which the covariance follows.
+The center of a box is not where the center of the object is seen: that is off by up to 3 mm for blocks and 13 mm for
+cones. So a solid is fitted to the box rather than its center cast back: where must a solid of the known height and form
+stand, and how wide must it be, for its box to have these four edges? Gauss-Newton steps find out, and the last of them
+carries the derivatives by all that went in, from which the covariance follows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,75 +17,73 @@ import numpy as np
 from flax import struct
 
 from arm5dof.vision.camera import Array, Camera
-from arm5dof.vision.localization.solids import FORMS, Solid, box
+from arm5dof.vision.localization.solids import FORMS, solid_box
 
 STEPS = 10
 
-HINT = 0.01
-"""Weight of things being as deep as they are wide, beside boxes weighted by pixels. It moves what a box tells by less
-than a micrometre, and keeps things from vanishing whose boxes are too flat to tell any depth."""
+SQUARE_WEIGHT = 0.01
+"""Weight of objects being as deep as they are wide, beside boxes weighted by their standard deviation. It moves what a
+box tells by less than a micrometre, and keeps objects from vanishing whose boxes are too flat to tell any depth."""
 
-PLANE = 1e-3
-"""Weight of the table beside boxes weighted by pixels, metres. Nothing else tells the height, so any will do."""
-
-
-class Things(struct.PyTreeNode):
-    """What is known of the things detected, as arrays."""
-
-    half_height: Array
-    """(n,), metres."""
-    deviation: Array
-    """Standard deviations of the half heights, (n,), metres."""
-    form: Array
-    """Places in `FORMS`, (n,), int."""
-
-    @classmethod
-    def of(cls, solids: Sequence[Solid]) -> Things:
-        return cls(
-            np.array([solid.half_height for solid in solids]),
-            np.array([solid.deviation for solid in solids]),
-            np.array([list(FORMS).index(solid.form) for solid in solids], int),
-        )
+TABLE_STD = 1e-3
+"""Standard deviation of the table's height beside boxes weighted by theirs, metres. Nothing else tells the height, so
+any will do."""
 
 
-class Explanation(struct.PyTreeNode):
-    """A solid that explains v boxes."""
+class BoxFit(struct.PyTreeNode):
+    """A solid that fits v boxes."""
 
-    middle: jax.Array
+    center: jax.Array
     """(3,) in the base frame, metres."""
     radii: jax.Array
     """Half its width and depth as each camera sees it, (v, 2), metres."""
-    misfit: jax.Array
+    reprojection_rms: jax.Array
     """Between its boxes and the given ones, root mean square over the edges, pixels."""
 
 
-def explain(
+class Uncertain(NamedTuple):
+    """A vector and how well it is known."""
+
+    value: jax.Array
+    """(k,)."""
+    covariance: jax.Array
+    """(k, k)."""
+
+
+def fit_box(
     cameras: Sequence[Camera],
     boxes: jax.Array,
     half_height: jax.Array,
     form: Array,
     start: Array,
-    table: float | None,
-    pixels: float,
-) -> Explanation:
-    """The solid that explains the boxes (v, 4) of one thing in the pictures of v cameras.
+    table_height: float | None,
+    box_std: float,
+) -> BoxFit:
+    """Fit a solid to the boxes of one object.
 
-    form:   its place in `FORMS`
-    start:  about where it is, (3,)
-    table:  the height that it stands on, metres; None if only the boxes are to tell
-    pixels: standard deviation of an edge
+    Args:
+        cameras: v cameras.
+        boxes: Its box in each camera's image, (v, 4), pixels.
+        half_height: Of the solid, (), metres.
+        form: Its index in `FORMS`, ().
+        start: About where it is, (3,), metres, base frame.
+        table_height: Of what it stands on in the base frame, metres; None if only the boxes are to tell.
+        box_std: Standard deviation of an edge, pixels.
+
+    Returns:
+        The best solid. It can be differentiated by cameras, boxes and half height.
     """
     parts = jnp.asarray(np.stack(list(FORMS.values())))[form]
 
     def residual(unknown: jax.Array, cameras: Sequence[Camera], boxes: jax.Array, half_height: jax.Array) -> jax.Array:
-        middle, logarithms = unknown[:3], unknown[3:].reshape(-1, 2)
+        center, logarithms = unknown[:3], unknown[3:].reshape(-1, 2)
         rows = [
-            (box(camera, middle, jnp.exp(radii), half_height, parts) - seen) / pixels
+            (solid_box(camera, center, jnp.exp(radii), half_height, parts) - seen) / box_std
             for camera, radii, seen in zip(cameras, logarithms, boxes, strict=True)
         ]
-        rows.append(HINT * (logarithms[:, 0] - logarithms[:, 1]))
-        if table is not None:
-            rows.append((middle[2:] - table - half_height) / PLANE)
+        rows.append(SQUARE_WEIGHT * (logarithms[:, 0] - logarithms[:, 1]))
+        if table_height is not None:
+            rows.append((center[2:] - table_height - half_height) / TABLE_STD)
         return jnp.concatenate(rows)
 
     def step(unknown: jax.Array, *given: Any) -> tuple[jax.Array, jax.Array]:
@@ -100,24 +98,48 @@ def explain(
         return unknown - jnp.clip(change, -1, 1)
 
     given = (cameras, boxes, half_height)
-    begin = jnp.concatenate([start, jnp.log(_half_sides(*jax.lax.stop_gradient(given[:2]), start)).repeat(2)])
+    begin = jnp.concatenate([start, jnp.log(_half_widths(*jax.lax.stop_gradient(given[:2]), start)).repeat(2)])
     found = jax.lax.fori_loop(0, STEPS, bounded, begin)
     change, left = step(found, *given)
-    unknown, edges = found - change, left[: boxes.size] * pixels
-    return Explanation(unknown[:3], jnp.exp(unknown[3:].reshape(-1, 2)), jnp.sqrt(jnp.mean(edges**2)))
+    unknown, edges = found - change, left[: boxes.size] * box_std
+    return BoxFit(unknown[:3], jnp.exp(unknown[3:].reshape(-1, 2)), jnp.sqrt(jnp.mean(edges**2)))
 
 
-def propagate(
-    estimate: Callable[..., tuple[jax.Array, Any]], given: Sequence[jax.Array], covariances: Sequence[jax.Array]
-) -> tuple[jax.Array, Any]:
-    """The covariance (3, 3), to first order, of a position that is estimated from several independent vectors (k,) with
-    covariances (k, k), and what else the estimate returns."""
-    jacobians, other = jax.jacfwd(estimate, tuple(range(len(given))), has_aux=True)(*given)
+def propagate(estimate: Callable[..., tuple[jax.Array, Any]], inputs: Sequence[Uncertain]) -> tuple[jax.Array, Any]:
+    """Propagate covariances through an estimate, to first order.
+
+    Args:
+        estimate: Takes the inputs' values, returns a position (3,) and anything else.
+        inputs: Independent of each other.
+
+    Returns:
+        The position's covariance, (3, 3), and what else the estimate returns.
+    """
+    values, covariances = zip(*inputs, strict=True)
+    jacobians, other = jax.jacfwd(estimate, tuple(range(len(values))), has_aux=True)(*values)
     return sum(j @ c @ j.T for j, c in zip(jacobians, covariances, strict=True)), other
 
 
-def _half_sides(cameras: Sequence[Camera], boxes: jax.Array, at: Array) -> jax.Array:
-    """About how wide (v,) a thing is whose boxes are these, metres."""
+def independent(values: Array, std: Array | float) -> Uncertain:
+    """Numbers (k,) of one standard deviation, independent of each other."""
+    return Uncertain(jnp.asarray(values), jnp.eye(len(values)) * std**2)
+
+
+def camera_errors(camera: Camera) -> Uncertain:
+    """The errors (m,) of a camera as `Camera.perturbed` takes them: zero as far as one knows, and their covariance,
+    zero too if it is unknown."""
+    size = 10 + camera.distortion.shape[0]
+    covariance = jnp.zeros((size, size)) if camera.covariance is None else jnp.asarray(camera.covariance)
+    return Uncertain(jnp.zeros(size), covariance)
+
+
+def box_center(box: Array) -> Array:
+    """The center (2,) of a box (4,), in pixels as `Camera` counts them: whole numbers are the centers of pixels."""
+    return (box[:2] + box[2:]) / 2 - 0.5
+
+
+def _half_widths(cameras: Sequence[Camera], boxes: jax.Array, at: Array) -> jax.Array:
+    """About how wide (v,) an object is whose boxes are these, metres."""
     return jnp.stack(
         [
             (seen[2] - seen[0] + seen[3] - seen[1]) / 4 * camera.to_camera(at)[2] / camera.matrix[0, 0]

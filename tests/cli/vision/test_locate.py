@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import tabletop
-from vision.localization.test_locate import detections
+from helpers.tabletop import detections
 
 from arm5dof.cli import main as cli
 from arm5dof.vision.camera import Camera
@@ -28,22 +28,22 @@ def folder(tmp_path_factory):
     """A posed camera, detections in both formats, and a depth image of what it sees."""
     folder, rng = tmp_path_factory.mktemp("locate"), np.random.default_rng(0)
     names = ["cube", "ball", "can"]
-    model, data, middles = tabletop.table(rng, names, [tabletop.over_the_table(rng)])
+    model, data, centers = tabletop.table(rng, names, [tabletop.over_the_table(rng)])
     camera = Camera.from_mujoco(model, "0", tabletop.WIDTH, tabletop.HEIGHT)
     camera = camera.replace(covariance=np.diag(np.square([*[0.5] * 4, *[1e-3] * 5, *[1e-3] * 6])))
     ids, depth = tabletop.cast(model, data, camera)
     found = detections(tabletop.boxes(model, ids, 3), names)
     camera.save(folder / "posed.yml")
-    camera.replace(posed=False).save(folder / "unposed.yml")
+    camera.replace(has_extrinsics=False).save(folder / "unposed.yml")
     camera.replace(covariance=None).save(folder / "bare.yml")
     hand = {"hand_rotation": camera.rotation, "hand_position": camera.position.reshape(3, 1)}
-    camera.replace(posed=False).save(folder / "on_hand.yml", hand)
+    camera.replace(has_extrinsics=False).save(folder / "on_hand.yml", hand)
     (folder / "list.json").write_text(found.to_json())
     frame = {"name": "a.jpg", "time_s": None, "image_size": [640, 480], "detections": json.loads(found.to_json())}
     (folder / "frames.json").write_text(json.dumps([frame, {**frame, "name": "b.jpg", "detections": []}]))
     (folder / "other.json").write_text(json.dumps([{**frame, "image_size": [320, 240]}]))
     cv2.imwrite(str(folder / "depth.png"), np.round(1000 * depth).astype(np.uint16))
-    np.save(folder / "middles.npy", middles)
+    np.save(folder / "centers.npy", centers)
     return folder
 
 
@@ -57,33 +57,33 @@ def told(capsys, *words):
 
 
 def test_for_programs(folder, capsys):
-    middles = np.load(folder / "middles.npy")
+    centers = np.load(folder / "centers.npy")
     (frame,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS)
-    assert frame["name"] is None and [thing["class_name"] for thing in frame["things"]] == ["cube", "ball", "can"]
-    cube, ball, can = frame["things"]
-    for thing, middle in zip((cube, ball), middles, strict=False):
-        np.testing.assert_allclose(thing["position"], middle, atol=2e-3)
-        assert thing["reason"] is None and (np.linalg.eigvalsh(thing["covariance"]) > 0).all()
+    assert frame["name"] is None and [each["class_name"] for each in frame["objects"]] == ["cube", "ball", "can"]
+    cube, ball, can = frame["objects"]
+    for each, center in zip((cube, ball), centers, strict=False):
+        np.testing.assert_allclose(each["position"], center, atol=2e-3)
+        assert each["reason"] is None and (np.linalg.eigvalsh(each["covariance"]) > 0).all()
     assert can == {**can, "position": None, "covariance": None, "reason": "no height is known of can"}
 
     first, second = told(capsys, folder / "frames.json", "--camera", folder / "posed.yml", *HEIGHTS)
-    assert first == {"name": "a.jpg", "things": frame["things"]} and second == {"name": "b.jpg", "things": []}
+    assert first == {"name": "a.jpg", "objects": frame["objects"]} and second == {"name": "b.jpg", "objects": []}
     seen = ["--depth", folder / "depth.png"]
     (by_depth,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, *seen)
-    np.testing.assert_allclose(by_depth["things"][1]["position"], middles[1], atol=2e-3)
+    np.testing.assert_allclose(by_depth["objects"][1]["position"], centers[1], atol=2e-3)
     (near,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--reach", "0", "0.01")
-    assert near["things"][0]["reason"] == "outside the workspace"
-    (rough,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--pixels", "20")
-    assert np.trace(rough["things"][0]["covariance"]) > 50 * np.trace(cube["covariance"])
+    assert near["objects"][0]["reason"] == "outside the workspace"
+    (rough,) = told(capsys, folder / "list.json", "--camera", folder / "posed.yml", *HEIGHTS, "--box-std", "20")
+    assert np.trace(rough["objects"][0]["covariance"]) > 50 * np.trace(cube["covariance"])
     # The hand at the base: the camera is where it was.
     words = ["--camera", folder / "on_hand.yml", "--hand", 0, 0, 0, 1, 0, 0, 0]
-    assert told(capsys, folder / "list.json", *words, *HEIGHTS)[0]["things"][0] == cube
+    assert told(capsys, folder / "list.json", *words, *HEIGHTS)[0]["objects"][0] == cube
 
 
 def test_two_cameras(folder, tmp_path, capsys):
-    """The same things from elsewhere, in the air for all that one knows of the table."""
+    """The same objects from elsewhere, in the air for all that one knows of the table."""
     rng, names = np.random.default_rng(0), ["cube", "ball", "can"]
-    model, data, middles = tabletop.table(rng, names, [tabletop.over_the_table(rng) for _ in range(2)])
+    model, data, centers = tabletop.table(rng, names, [tabletop.over_the_table(rng) for _ in range(2)])
     files, words = [], list(HEIGHTS)
     for name, shown in (("0", names), ("1", names[:2])):
         camera = Camera.from_mujoco(model, name, tabletop.WIDTH, tabletop.HEIGHT)
@@ -93,14 +93,14 @@ def test_two_cameras(folder, tmp_path, capsys):
         files += [tmp_path / f"{name}.json"]
         words += ["--camera", tmp_path / f"{name}.yml"]
     (frame,) = told(capsys, *files, *words, "--table", "0.5")
-    cube, ball, can = frame["things"]
-    np.testing.assert_allclose([cube["position"], ball["position"]], middles[:2], atol=2e-3)
+    cube, ball, can = frame["objects"]
+    np.testing.assert_allclose([cube["position"], ball["position"]], centers[:2], atol=2e-3)
     assert can["position"] is None and can["reason"] == "the other picture shows no can there"
 
 
-def test_a_simulated_picture_becomes_places(tmp_path, capsys, monkeypatch):
-    """From pixels to metres: the camera's picture of a scene, the boxes of what can be seen in it as a frame that
-    `vision detect` prints, and their places by `vision locate`, which knows what stands on that table. By the picture,
+def test_a_simulated_image_becomes_places(tmp_path, capsys, monkeypatch):
+    """From pixels to metres: the camera's image of a scene, the boxes of what can be seen in it as a frame that
+    `vision detect` prints, and their places by `vision locate`, which knows what stands on that table. By the image,
     and by the depth image."""
     errors = []
     for seed in range(8):
@@ -117,12 +117,12 @@ def test_a_simulated_picture_becomes_places(tmp_path, capsys, monkeypatch):
         for more in ([], ["--depth", tmp_path / f"{seed}.png"]):
             monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps([frame])))
             (said,) = told(capsys, "-", "--camera", tmp_path / f"{seed}.yml", *more)
-            assert said["name"] == f"scene {seed}" and len(said["things"]) == len(found)
-            for thing, name, place in zip(said["things"], found.data["class_name"], there.position[whole], strict=True):
-                assert thing["class_name"] == name
-                assert thing["reason"] in (None, "the picture's edge cuts it off")
-                if thing["position"]:
-                    errors.append(np.linalg.norm(np.subtract(thing["position"], place)))
+            assert said["name"] == f"scene {seed}" and len(said["objects"]) == len(found)
+            for each, name, place in zip(said["objects"], found.data["class_name"], there.position[whole], strict=True):
+                assert each["class_name"] == name
+                assert each["reason"] in (None, "the picture's edge cuts it off")
+                if each["position"]:
+                    errors.append(np.linalg.norm(np.subtract(each["position"], place)))
     assert len(errors) > 30 and np.median(errors) < 6e-4 and np.max(errors) < 2.5e-3
 
 
@@ -136,11 +136,11 @@ def test_a_photograph_becomes_places(test_data, tmp_path, capsys):
     matrix = np.array([[900, 0, 405], [0, 900, 540], [0, 0, 1.0]])
     Camera(matrix, np.zeros(5), level @ down, np.array([0, 0, 1.7]), 810, 1080).save(tmp_path / "camera.yml")
     (frame,) = told(
-        capsys, tmp_path / "found.json", "--camera", tmp_path / "camera.yml", "--height", "person=0.86", "--pixels", 10
+        capsys, tmp_path / "found.json", "--camera", tmp_path / "camera.yml", "--height", "person=0.86", "--box-std", 10
     )
-    reasons = [(thing["class_name"], thing["reason"]) for thing in frame["things"]]
+    reasons = [(each["class_name"], each["reason"]) for each in frame["objects"]]
     assert ("bus", "no height is known of bus") in reasons and len(reasons) == 4
-    people = [thing["position"] for thing in frame["things"] if thing["position"]]
+    people = [each["position"] for each in frame["objects"] if each["position"]]
     # Two who wait at about the same distance, on the left; the third is cut off.
     assert len(people) == 2 and all(2 < x < 5 and 0 < y < 2 and abs(z - 0.86) < 1e-3 for x, y, z in people)
 
@@ -150,7 +150,7 @@ def test_for_people(folder, capsys):
     captured = capsys.readouterr()
     name, head, cube, _, can, other, nothing = captured.out.splitlines()
     assert (name, other, nothing) == ("a.jpg", "b.jpg", "  nothing") and head.split()[:2] == ["class", "conf"]
-    position = 1e3 * np.load(folder / "middles.npy")[0]
+    position = 1e3 * np.load(folder / "centers.npy")[0]
     label, confidence, *numbers = cube.split()
     assert (label, confidence) == ("cube", "0.90")
     np.testing.assert_allclose([float(n) for n in numbers[:3]], position, atol=2)
@@ -176,14 +176,14 @@ def test_bad_input_is_one_line(folder, tmp_path, capfd):
         err = capfd.readouterr().err
         assert err.startswith("arm5dof: ") and "holds no detections: give the JSON" in err and err.count("\n") == 1
     for changes, expected in [
-        ({"camera": folder / "unposed.yml"}, "nobody has said where the camera stands"),
-        ({"camera": folder / "on_hand.yml"}, "nobody has said where the camera stands"),
+        ({"camera": folder / "unposed.yml"}, "the camera has no extrinsics"),
+        ({"camera": folder / "on_hand.yml"}, "the camera has no extrinsics"),
         ({"camera": folder / "list.json"}, "no camera"),
         ({"height": "cube"}, "is no NAME=METRES"),
         ({"height": "cube=x"}, "is no NAME=METRES"),
         ({"height": "cube=0"}, "give metres above zero"),
         ({"height": "cube=0.01:pea"}, "no form 'pea': choose from block, ball, cone"),
-        ({"pixels": 0}, "a number of pixels above zero"),
+        ({"box-std": 0}, "a number of pixels above zero"),
         ({"table": "nan"}, "--table"),
         ({"reach": [0.3, 0.1]}, "--reach takes the smallest distance and the largest"),
         ({"hand": [0, 0, 0, 1, 0, 0, 0]}, "has no hand_rotation"),

@@ -1,4 +1,4 @@
-"""`arm5dof vision locate` on images, videos, cameras and random scenes: pictures in, points out."""
+"""`arm5dof vision locate` on images, videos, cameras and random scenes: images in, points out."""
 
 import json
 
@@ -58,19 +58,19 @@ def small(tmp_path_factory):
 
 
 SMALL_BALL = 0.2 + 0.5 * (20 - 32) / 100, 0.5 * (32 - 28) / 100, 0.02
-"""Where the middle of its box is seen, by similar triangles; the thing is seen from a little aside."""
+"""Where the center of its box is seen, by similar triangles; the object is seen from a little aside."""
 
 
-def errors(things, there):
-    """Distances of things from the nearest of their class, metres."""
-    names = [thing["class_name"] for thing in things]
+def errors(objects, there):
+    """Distances of objects from the nearest of their class, metres."""
+    names = [found["class_name"] for found in objects]
     true = {
-        name: there.position[there.class_id == thing["class_id"]] for name, thing in zip(names, things, strict=True)
+        name: there.position[there.class_id == found["class_id"]] for name, found in zip(names, objects, strict=True)
     }
     return [
-        np.linalg.norm(true[name] - thing["position"], axis=1).min(initial=np.inf)
-        for name, thing in zip(names, things, strict=True)
-        if thing["position"]
+        np.linalg.norm(true[name] - found["position"], axis=1).min(initial=np.inf)
+        for name, found in zip(names, objects, strict=True)
+        if found["position"]
     ]
 
 
@@ -78,15 +78,15 @@ def test_random_scenes(shots, tmp_path, capsys):
     frames = told(capsys, f"simulated:{SCENES}", "--out", tmp_path / "placed")
     assert frames == json.loads((tmp_path / "placed" / "positions.json").read_text())
     assert [frame["name"] for frame in frames] == [f"scene{number}.png" for number in range(SCENES)]
-    off = np.concatenate([errors(f["things"], shot.truth) for f, shot in zip(frames, shots, strict=True)])
-    # The detector may see a thing where there is none.
+    off = np.concatenate([errors(f["objects"], shot.truth) for f, shot in zip(frames, shots, strict=True)])
+    # The detector may see an object where there is none.
     assert len(off) >= 8 and np.median(off) < 2e-3 and np.mean(off < 5e-3) > 0.9
     for frame, shot in zip(frames, shots, strict=True):
         drawn = read(tmp_path / "placed" / frame["name"])
         changed = (drawn != shot.image).any(-1)
         assert drawn.shape == shot.image.shape and changed.mean() < 0.3
-        for thing in frame["things"]:
-            left, top, _, bottom = map(round, thing["xyxy"])
+        for found in frame["objects"]:
+            left, top, _, bottom = map(round, found["xyxy"])
             assert changed[top:bottom, left].mean() > 0.9
 
 
@@ -96,9 +96,9 @@ def test_a_photograph_and_its_camera(shots, photo, tmp_path, capsys):
     (frame,) = told(capsys, *words, "--out", tmp_path / "placed")
     assert frame["name"] == str(photo) and frame["time_s"] is None and frame["image_size"] == [640, 480]
     assert {p.name for p in (tmp_path / "placed").iterdir()} == {"scene.png", "positions.json"}
-    simulated = told(capsys, "simulated:2")[1]["things"]
-    assert [thing["xyxy"] for thing in frame["things"]] == [thing["xyxy"] for thing in simulated]
-    for ours, theirs in zip(frame["things"], simulated, strict=True):
+    simulated = told(capsys, "simulated:2")[1]["objects"]
+    assert [found["xyxy"] for found in frame["objects"]] == [found["xyxy"] for found in simulated]
+    for ours, theirs in zip(frame["objects"], simulated, strict=True):
         np.testing.assert_allclose(ours["position"], theirs["position"], atol=1e-5)
         assert np.linalg.eigvalsh(ours["covariance"]).min() > 0 and ours["reason"] is None
 
@@ -107,7 +107,7 @@ def test_a_photograph_and_its_camera(shots, photo, tmp_path, capsys):
     millimetres = np.round(1000 * np.nan_to_num(depth, posinf=0)).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "depth.png"), millimetres)
     (seen,) = told(capsys, *words, "--depth", tmp_path / "depth.png")
-    off = errors(seen["things"], shots[1].truth)
+    off = errors(seen["objects"], shots[1].truth)
     assert len(off) > 3 and np.median(off) < 4e-3
 
 
@@ -130,7 +130,7 @@ def test_a_video_with_a_detector_of_ones_own(small, tmp_path, capsys):
     frames = json.loads((out / "positions.json").read_text())
     np.testing.assert_allclose([frame["time_s"] for frame in frames], np.arange(5) / 12.5, atol=1e-3)
     for frame in frames:
-        (ball,) = frame["things"]
+        (ball,) = frame["objects"]
         assert (ball["class_name"], ball["xyxy"]) == ("ball", [12, 16, 28, 40])
         np.testing.assert_allclose(ball["position"], SMALL_BALL, atol=5e-3)
     pictures, before = read_video(out / "clip.mp4")[0], read_video(clip)[0]
@@ -147,7 +147,7 @@ def test_a_camera_that_is_taken_away(small, tmp_path, capsys, monkeypatch):
     assert command(0, *small, "--out", tmp_path / "placed", "--reach", 0, 0.01) == 2
     assert f"any more: was it unplugged or closed?; 3 frames before that in {tmp_path}" in capsys.readouterr().err
     frames = json.loads((tmp_path / "placed" / "positions.json").read_text())
-    assert [[thing["reason"] for thing in frame["things"]] for frame in frames] == [["outside the workspace"]] * 3
+    assert [[found["reason"] for found in frame["objects"]] for frame in frames] == [["outside the workspace"]] * 3
 
 
 def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
@@ -193,7 +193,7 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
         assert captured.err.count("\n") == 1 and not captured.out and sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_picture_of_another_size_leaves_those_before(photo, tmp_path, capfd):
+def test_an_image_of_another_size_leaves_those_before(photo, tmp_path, capfd):
     other = tmp_path / "other.png"
     cv2.imwrite(str(other), np.zeros((240, 320), np.uint8))
     words = ["--camera", photo.with_name("posed.yml"), "--out", tmp_path / "placed"]

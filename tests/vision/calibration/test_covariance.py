@@ -6,9 +6,10 @@ from helpers.tabletop import HEIGHT, LENS, WIDTH, over_the_table, pose
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from arm5dof.vision.calibration import covariance as uncertainty
 from arm5dof.vision.calibration.boards import Checkerboard
-from arm5dof.vision.calibration.intrinsics import calibrate, find_views
+from arm5dof.vision.calibration.covariance import add_pose, placement_covariance
+from arm5dof.vision.calibration.intrinsics import calibrate
+from arm5dof.vision.calibration.views import find_views
 from arm5dof.vision.camera import Camera
 
 
@@ -27,7 +28,7 @@ def test_deviations_are_opencvs_own(test_data):
     result = calibrate(find_views(paths, Checkerboard(9, 6, 0.025)))
     deviations = np.sqrt(np.diag(result.camera.covariance))
     np.testing.assert_allclose(deviations[:9], result.deviations, rtol=1e-4)
-    assert not deviations[9:].any() and not result.camera.posed
+    assert not deviations[9:].any() and not result.camera.has_extrinsics
 
 
 def test_intrinsics_and_pose_are_off_as_stated():
@@ -50,7 +51,7 @@ def test_a_board_out_of_place_takes_the_camera_with_it():
     rng = np.random.default_rng(1)
     camera = over_the_table(rng)
     seen = np.linalg.inv(camera) @ tabletop.BOARD_TO_BASE
-    expected = uncertainty.carried((1e-3, 5e-3), seen)
+    expected = placement_covariance((1e-3, 5e-3), seen)
     errors = []
     for _ in range(4000):
         turn = Rotation.from_rotvec(5e-3 * rng.normal(size=3)).as_matrix()
@@ -63,6 +64,6 @@ def test_a_board_out_of_place_takes_the_camera_with_it():
 
 
 def test_a_camera_of_which_nothing_is_known_stays_one():
-    camera = Camera(*LENS, np.eye(3), np.zeros(3), WIDTH, HEIGHT, posed=False)
-    posed = uncertainty.with_pose(camera, lambda c: pose(np.eye(3), [0, 0, 1]), np.eye(6))
-    assert posed.posed and posed.covariance is None and posed.position[2] == 1
+    camera = Camera(*LENS, np.eye(3), np.zeros(3), WIDTH, HEIGHT, has_extrinsics=False)
+    posed = add_pose(camera, lambda c: pose(np.eye(3), [0, 0, 1]), np.eye(6))
+    assert posed.has_extrinsics and posed.covariance is None and posed.position[2] == 1

@@ -28,7 +28,7 @@ def scene(rng, n=15, tilt=40):
     return camera, board, board @ np.linalg.inv(camera @ seen), seen
 
 
-def disturbed(poses, turns_deg, shifts_mm):
+def perturbed(poses, turns_deg, shifts_mm):
     """Poses (n, 4, 4) with rotation vectors and shifts (n, 3) added."""
     result = poses.copy()
     result[:, :3, :3] = Rotation.from_rotvec(np.deg2rad(turns_deg)).as_matrix() @ poses[:, :3, :3]
@@ -75,9 +75,9 @@ def test_fifteen_noisy_poses_give_the_camera_to_a_millimetre(noisy):
         camera, _, hands, seen = scene(rng)
         turns, shifts = 0.2 * directions(rng, 15), directions(rng, 15)
         if noisy == "board":
-            seen = disturbed(seen, turns, shifts)
+            seen = perturbed(seen, turns, shifts)
         else:
-            hands = disturbed(hands, turns, shifts)
+            hands = perturbed(hands, turns, shifts)
         found.append(errors(eye_in_hand(hands, seen).camera, camera))
     millimetres, degrees = np.median(found, axis=0)
     assert millimetres <= 1 and degrees <= 0.1
@@ -91,7 +91,7 @@ def test_nobody_could_do_better():
         rng = np.random.default_rng(seed)
         camera, board, hands, seen = scene(rng)
         noise = rng.normal(size=(2, 15, 3))
-        result = eye_in_hand(hands, disturbed(seen, 0.2 * noise[0], noise[1]))
+        result = eye_in_hand(hands, perturbed(seen, 0.2 * noise[0], noise[1]))
         found.append(errors(result.camera, camera))
 
         def measured(step, hands=hands, camera=camera, board=board, seen=seen):
@@ -124,7 +124,7 @@ def test_degenerate_motions_are_refused():
     for turns in (rng.uniform(-1, 1, (15, 1)) * axis, np.zeros((15, 3))):
         parallel = np.array([pose(Rotation.from_rotvec(t), rng.uniform(-0.2, 0.2, 3)) for t in turns])
         looks = np.linalg.inv(parallel @ camera) @ board
-        shaken = disturbed(looks, 0.2 * directions(rng, 15), directions(rng, 15))
+        shaken = perturbed(looks, 0.2 * directions(rng, 15), directions(rng, 15))
         for function, arms in ((eye_in_hand, parallel), (eye_to_hand, np.linalg.inv(parallel))):
             for boards in (looks, shaken):
                 with pytest.raises(UserError, match="about parallel axes only") as caught:

@@ -1,28 +1,26 @@
-"""Things located by a depth image, as MuJoCo's rays measure it."""
+"""Objects located by a depth image, as MuJoCo's rays measure it."""
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from helpers import tabletop
-from helpers.tabletop import SOLIDS, over_the_table
+from helpers.tabletop import NAMES, SOLIDS, detections, over_the_table
 from scipy.stats import chi2
-from vision.localization.test_locate import NAMES, detections
 
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.localization.depth import by_depth, read_depth
-from arm5dof.vision.localization.locate import by_plane
+from arm5dof.vision.localization.depth import by_depth
+from arm5dof.vision.localization.table_plane import by_plane
 
 
 def scene(rng, names, low=30, high=88):
-    """A camera, the boxes and middles of what it sees, depths (h, w), and which thing each pixel shows, counted from 1
+    """A camera, the boxes and centers of what it sees, depths (h, w), and which object each pixel shows, counted from 1
     (h, w)."""
-    model, data, middles = tabletop.table(rng, names, [over_the_table(rng, low, high)])
+    model, data, centers = tabletop.table(rng, names, [over_the_table(rng, low, high)])
     camera = Camera.from_mujoco(model, "0", tabletop.WIDTH, tabletop.HEIGHT)
     ids, depth = tabletop.cast(model, data, camera)
-    return camera, tabletop.boxes(model, ids, len(names)), middles, depth, ids
+    return camera, tabletop.boxes(model, ids, len(names)), centers, depth, ids
 
 
 def above_the_table(camera, box, depth):
@@ -40,35 +38,35 @@ def test_what_mujoco_measures_is_located():
     errors, plain, by_box = [], [], []
     for _ in range(20):
         names = list(rng.choice(NAMES, 4, replace=False))
-        camera, boxes, middles, depth, _ = scene(rng, names)
+        camera, boxes, centers, depth, _ = scene(rng, names)
         depth = depth + 2e-3 * rng.normal(size=depth.shape)
         boxes = boxes + rng.normal(size=boxes.shape)
         found = by_depth(detections(boxes, names), depth, camera, SOLIDS)
-        assert not any(found.reasons)
-        errors += [*np.linalg.norm(found.position - middles, axis=1)]
+        assert not any(found.failure)
+        errors += [*np.linalg.norm(found.position - centers, axis=1)]
         on_plane = by_plane(detections(boxes, names), camera, SOLIDS).position
-        by_box += [*np.linalg.norm(on_plane - middles, axis=1)]
-        plain += [np.linalg.norm(above_the_table(camera, b, depth) - m) for b, m in zip(boxes, middles, strict=True)]
+        by_box += [*np.linalg.norm(on_plane - centers, axis=1)]
+        plain += [np.linalg.norm(above_the_table(camera, b, depth) - m) for b, m in zip(boxes, centers, strict=True)]
     assert np.median(errors) < 8e-4 and np.percentile(errors, 95) < 2.5e-3
     assert np.median(plain) > 5 * np.median(errors) and np.median(by_box) > 1.4 * np.median(errors)
 
 
 def test_the_stated_covariance_is_that_of_the_errors():
-    """The camera off as calibrations are, heights by half a millimetre, boxes by a pixel, depths by 2 mm that a thing's
-    pixels share and 1 mm that they do not."""
+    """The camera off as calibrations are, heights by half a millimetre, boxes by a pixel, depths by 2 mm that the
+    pixels of an object share and 1 mm that they do not."""
     rng = np.random.default_rng(5)
     distance = []
     for _ in range(100):
         names = list(rng.choice(NAMES, 4, replace=False))
-        camera, boxes, middles, depth, shows = scene(rng, names)
+        camera, boxes, centers, depth, shows = scene(rng, names)
         _, known = tabletop.calibrated_and_posed(rng)
         error = rng.multivariate_normal(np.zeros(15), known.covariance, method="svd")
-        taken = camera.disturbed(error).replace(covariance=known.covariance)
-        solids = {n: replace(s, half_height=s.half_height + s.deviation * rng.normal()) for n, s in SOLIDS.items()}
+        taken = camera.perturbed(error).replace(covariance=known.covariance)
+        solids = {n: replace(s, half_height=s.half_height + s.std * rng.normal()) for n, s in SOLIDS.items()}
         depth = depth + np.append(0, 2e-3 * rng.normal(size=4))[shows] + 1e-3 * rng.normal(size=depth.shape)
-        found = by_depth(detections(boxes + rng.normal(size=(4, 4)), names), depth, taken, solids, deviation=2e-3)
-        for i in np.flatnonzero([not reason for reason in found.reasons]):
-            error = found.position[i] - middles[i]
+        found = by_depth(detections(boxes + rng.normal(size=(4, 4)), names), depth, taken, solids, depth_std=2e-3)
+        for i in np.flatnonzero([not reason for reason in found.failure]):
+            error = found.position[i] - centers[i]
             distance.append(error @ np.linalg.solve(found.covariance[i], error))
     assert len(distance) > 390
     for nominal in (0.5, 0.68, 0.95):
@@ -76,51 +74,40 @@ def test_the_stated_covariance_is_that_of_the_errors():
 
 
 @pytest.mark.parametrize("hidden", ["near", "left"])
-def test_an_arm_before_a_thing_moves_it_little(hidden):
-    """A third of each box shows something 15 cm nearer. The mean of what is left of a thing is off by a third of its
+def test_an_arm_before_an_object_moves_it_little(hidden):
+    """A third of each box shows something 15 cm nearer. The mean of what is left of an object is off by a third of its
     half width, 5 mm and more; of a brick that is turned, which third is gone cannot be told from an ellipse."""
     rng = np.random.default_rng(2)
     errors = []
     for _ in range(10):
         names = ["cube", "can", "brick"]
-        camera, boxes, middles, depth, _ = scene(rng, names, 40, 80)
+        camera, boxes, centers, depth, _ = scene(rng, names, 40, 80)
         for left, top, right, bottom in boxes.astype(int):
             if hidden == "near":
                 depth[bottom - (bottom - top) // 3 : bottom + 5, left:right] -= 0.15
             else:
                 depth[top:bottom, left - 5 : left + (right - left) // 3] -= 0.15
         found = by_depth(detections(boxes, names), depth, camera, SOLIDS)
-        assert not any(found.reasons)
-        errors.append(np.linalg.norm(found.position - middles, axis=1))
+        assert not any(found.failure)
+        errors.append(np.linalg.norm(found.position - centers, axis=1))
     assert np.median(errors, axis=0)[:2].max() < 2e-3 and np.max(errors) < 6e-3
 
 
 def test_without_depth_there_is_a_reason():
     rng = np.random.default_rng(3)
-    camera, boxes, middles, depth, _ = scene(rng, ["cube", "ball"])
+    camera, boxes, centers, depth, _ = scene(rng, ["cube", "ball"])
     found = detections(boxes, ["cube", "ball"])
     left, top, right, bottom = boxes[0].astype(int)
     for missing in (0, np.nan, np.inf, -1):
         holes = depth.copy()
         holes[top - 3 : bottom + 3, left - 3 : right + 3] = missing
         located = by_depth(found, holes, camera, SOLIDS)
-        assert located.reasons == ("the depth image shows too little of it", "")
+        assert located.failure == ("the depth image shows too little of it", "")
         assert np.isnan(located.position[0]).all()
-        np.testing.assert_allclose(located.position[1], middles[1], atol=2e-3)
+        np.testing.assert_allclose(located.position[1], centers[1], atol=2e-3)
     unknown = by_depth(found, depth, camera, {"cube": 0.015}, workspace=lambda points: points[:, 0] > 1)
-    assert unknown.reasons == ("outside the workspace", "no height is known of ball")
+    assert unknown.failure == ("outside the workspace", "no height is known of ball")
     with pytest.raises(UserError, match="has 320x480 pixels and the camera 640x480"):
         by_depth(found, depth[:, :320], camera, SOLIDS)
-    with pytest.raises(UserError, match="nobody has said where the camera stands"):
-        by_depth(found, depth, camera.replace(posed=False), SOLIDS)
-
-
-def test_depth_images_are_millimetres_in_sixteen_bits(tmp_path):
-    path = tmp_path / "depth.png"
-    millimetres = np.arange(12, dtype=np.uint16).reshape(3, 4) * 500
-    cv2.imwrite(str(path), millimetres)
-    np.testing.assert_array_equal(read_depth(path), millimetres / 1000)
-    for content in (b"", b"hello", cv2.imencode(".png", millimetres.astype(np.uint8))[1].tobytes()):
-        path.write_bytes(content)
-        with pytest.raises(UserError, match="is no depth image: give a PNG file with one channel of 16 bits"):
-            read_depth(path)
+    with pytest.raises(UserError, match="the camera has no extrinsics"):
+        by_depth(found, depth, camera.replace(has_extrinsics=False), SOLIDS)

@@ -1,237 +1,101 @@
-"""Things located on a table, against MuJoCo's segmentation, OpenCV's projection, and the errors that were put in."""
+"""`locate` takes the way that what it is given allows."""
 
-import cv2
-import jax
+import doctest
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from helpers import tabletop
-from helpers.tabletop import SOLIDS, camera_at, over_the_table
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.stats import chi2
+from helpers.tabletop import SOLIDS, detections, over_the_table
 
 from arm5dof.errors import UserError
-from arm5dof.vision.detections import Detections
-from arm5dof.vision.localization.locate import by_plane
-from arm5dof.vision.localization.solids import FORMS, Solid, box
+from arm5dof.vision import localization
+from arm5dof.vision.camera import Camera
+from arm5dof.vision.localization import locate
+from arm5dof.vision.localization.common import within_distance
+from arm5dof.vision.localization.depth import by_depth
+from arm5dof.vision.localization.multi_view import by_views
+from arm5dof.vision.localization.table_plane import by_plane
 
-SEEDS = st.integers(0, 2**32 - 1)
-NAMES = tuple(SOLIDS)
-
-
-def detections(boxes, names):
-    """In the order given: the first is the most confident."""
-    ids = [NAMES.index(name) for name in names]
-    return Detections(boxes, np.linspace(0.9, 0.5, len(ids)), ids, NAMES)
+OBJECTS = ["cube", "ball", "can"]
 
 
-many_boxes = jax.jit(jax.vmap(box, (None, 0, 0, 0, 0)))
-
-
-def ideal_boxes(camera, middles, radii, names, half_heights=None):
-    """The boxes (n, 4) of solids of known width."""
-    if half_heights is None:
-        half_heights = [SOLIDS[name].half_height for name in names]
-    forms = np.array([FORMS[SOLIDS[name].form] for name in names])
-    return np.asarray(many_boxes(camera, middles, radii, np.array(half_heights), forms))
-
-
-def on_the_table(rng, names):
-    places = np.c_[rng.uniform(0.05, 0.28, len(names)), rng.uniform(-0.12, 0.12, len(names))]
-    return np.c_[places, [SOLIDS[name].half_height for name in names]]
-
-
-def random_lens(rng, coefficients):
-    """Distortion such as lenses have: the corners of the picture move by up to some 60 pixels."""
-    scale = np.array([0.25, 0.08, 2e-3, 2e-3, 0.03, 0.1, 0.03, 0.01])[:coefficients]
-    focal = rng.uniform(450, 700)
-    matrix = np.array([[focal, 0, rng.uniform(300, 340)], [0, focal * rng.uniform(0.95, 1.05), 240], [0, 0, 1]])
-    return matrix, scale * rng.uniform(-1, 1, coefficients)
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_boxes_surround_the_points_of_a_solid_as_opencv_projects_them(form):
+@pytest.fixture(scope="module")
+def scene():
+    """Detections in the images of three cameras, the cameras, and the first one's depth image."""
     rng = np.random.default_rng(0)
-    angles = np.linspace(0, 2 * np.pi, 721)
-    levels = {"block": [(-1, 1), (1, 1)], "cone": [(-1, 1), (1, 0)]}.get(
-        form, [(np.sin(a), np.cos(a)) for a in np.linspace(-np.pi / 2, np.pi / 2, 361)]
-    )
-    for coefficients in (4, 5, 8):
-        camera = camera_at(over_the_table(rng), random_lens(rng, coefficients))
-        middle, radii, half_height = np.array([0.2, 0.08, 0.02]), np.array([0.015, 0.03]), 0.02
-        x = np.append(camera.rotation[:2, 0], 0) / np.linalg.norm(camera.rotation[:2, 0])
-        y = np.array([-x[1], x[0], 0])
-        ring = radii[0] * np.cos(angles)[:, None] * x + radii[1] * np.sin(angles)[:, None] * y
-        points = np.concatenate([middle + width * ring + [0, 0, half_height * level] for level, width in levels])
-        turn, _ = cv2.Rodrigues(camera.rotation.T)
-        pixels, _ = cv2.projectPoints(
-            points, turn, -camera.rotation.T @ camera.position, *(camera.matrix, camera.distortion)
-        )
-        expected = np.concatenate([pixels[:, 0].min(0), pixels[:, 0].max(0)]) + 0.5
-        found = box(camera, middle, radii, half_height, FORMS[form])
-        np.testing.assert_allclose(found, expected, atol=0.05)
+    model, data, _ = tabletop.table(rng, OBJECTS, [over_the_table(rng) for _ in range(3)])
+    cameras = [Camera.from_mujoco(model, name, tabletop.WIDTH, tabletop.HEIGHT) for name in "012"]
+    seen = [tabletop.cast(model, data, camera) for camera in cameras]
+    return [detections(tabletop.boxes(model, ids, 3), OBJECTS) for ids, _ in seen], cameras, seen[0][1]
 
 
-@given(SEEDS, st.sampled_from([5, 8]))
-def test_what_is_projected_is_located(seed, coefficients):
-    """Any camera, and any solid whose box it sees: the way back leads to where it stood."""
-    rng = np.random.default_rng(seed)
-    names = list(rng.choice(NAMES, 8))
-    middles, radii = on_the_table(rng, names), rng.uniform(0.01, 0.03, (8, 2))
-    with jax.enable_x64(True):
-        camera = camera_at(over_the_table(rng, 20, 89), random_lens(rng, coefficients))
-        found = by_plane(detections(ideal_boxes(camera, middles, radii, names), names), camera, SOLIDS)
-    assert all(reason in ("", "the picture's edge cuts it off") for reason in found.reasons)
-    seen = np.array([not reason for reason in found.reasons])
-    np.testing.assert_allclose(found.position[seen], middles[seen], atol=1e-6)
+def assert_same(one, other):
+    np.testing.assert_array_equal(one.position, other.position)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert one.failure == other.failure
+    np.testing.assert_array_equal(one.detections.xyxy, other.detections.xyxy)
 
 
-def test_what_mujoco_renders_is_located():
-    """Boxes around what MuJoCo's rays hit, whole pixels and no noise. The middle of the box, cast back onto the plane
-    of the middles, is what everybody does; it is further off, and for cones by a centimetre."""
-    rng = np.random.default_rng(1)
-    errors, plain = {name: [] for name in NAMES}, {name: [] for name in NAMES}
-    for _ in range(25):
-        names = list(rng.choice(NAMES, 4, replace=False))
-        model, data, middles = tabletop.table(rng, names, [over_the_table(rng, 30, 88)])
-        camera = tabletop.Camera.from_mujoco(model, "0", tabletop.WIDTH, tabletop.HEIGHT)
-        found = detections(tabletop.boxes(model, tabletop.cast(model, data, camera)[0], 4), names)
-        located = by_plane(found, camera, SOLIDS)
-        assert not any(located.reasons)
-        rays = np.asarray(camera.rays(found.center))
-        cast = camera.position + rays * ((middles[:, 2] - camera.position[2]) / rays[:, 2])[:, None]
-        for i, name in enumerate(names):
-            errors[name].append(1e3 * np.linalg.norm(located.position[i] - middles[i]))
-            plain[name].append(1e3 * np.linalg.norm(cast[i] - middles[i]))
-    every, before = np.concatenate(list(errors.values())), np.concatenate(list(plain.values()))
-    assert np.median(every) < 0.6 and np.percentile(every, 95) < 1.5
-    assert np.median(before) > 1.4 * np.median(every)
-    assert np.median(plain["cone"]) > 5 and np.median(errors["cone"]) < 1
-    assert np.median(plain["can"]) > 2 * np.median(errors["can"])
+def test_one_camera_takes_the_table(scene):
+    (first, *_), (camera, *_), _ = scene
+    options = {"table_height": 0.001, "box_std": 2.0, "workspace": within_distance(0.1, 0.25)}
+    expected = by_plane(first, camera, SOLIDS, **options)
+    assert_same(locate(first, camera, SOLIDS, **options), expected)
+    assert_same(locate([first], [camera], SOLIDS, **options), expected)
+    assert not np.array_equal(expected.position, by_plane(first, camera, SOLIDS).position)
 
 
-def test_the_stated_covariance_is_that_of_the_errors():
-    """Cameras calibrated from 13 noisy views and posed from a noisy board, boxes off by a pixel, heights by half a
-    millimetre: so many positions lie within so much of their covariance as should, and the bar of the project holds."""
-    rng = np.random.default_rng(2)
-    distance, errors = [], []
-    for _ in range(50):
-        true, camera = tabletop.calibrated_and_posed(rng)
-        names = list(rng.choice(NAMES, 8))
-        middles, radii = on_the_table(rng, names), rng.uniform(0.012, 0.025, (8, 2))
-        middles[:, 2] += 5e-4 * rng.normal(size=8)
-        boxes = ideal_boxes(true, middles, radii, names, middles[:, 2]) + rng.normal(size=(8, 4))
-        found = by_plane(detections(boxes, names), camera, SOLIDS)
-        for i in np.flatnonzero([not reason for reason in found.reasons]):
-            error = found.position[i] - middles[i]
-            distance.append(error @ np.linalg.solve(found.covariance[i], error))
-            errors.append(1e3 * np.linalg.norm(error))
-    assert len(distance) > 350
-    for nominal in (0.5, 0.68, 0.95):
-        assert abs(np.mean(np.array(distance) < chi2.ppf(nominal, 3)) - nominal) < 0.1
-    assert np.median(errors) <= 2 and np.percentile(errors, 95) <= 6
+def test_a_depth_image_is_used(scene):
+    (first, *_), (camera, *_), depth = scene
+    options = {"table_height": 0.001, "box_std": 2.0, "depth_std": 1e-3, "workspace": within_distance(0.1, 0.25)}
+    expected = by_depth(first, depth, camera, SOLIDS, **options)
+    assert_same(locate(first, camera, SOLIDS, depth=depth, **options), expected)
+    assert not np.array_equal(expected.position, by_plane(first, camera, SOLIDS).position)
 
 
-def test_the_covariance_is_made_of_derivatives():
-    """By the edges, taken by locating again with each a little off; by the height; by the camera, disturbed."""
-    rng = np.random.default_rng(3)
-    names = ["can", "ball"]
-    with jax.enable_x64(True):
-        camera = camera_at(over_the_table(rng))
-        boxes = ideal_boxes(camera, on_the_table(rng, names), np.full((2, 2), 0.02), names)
-
-        def position(boxes=boxes, camera=camera, raised=0.0):
-            solids = {name: Solid(SOLIDS[name].half_height + raised, SOLIDS[name].form, 0) for name in names}
-            found = by_plane(detections(boxes, names), camera, solids, pixels=1e-3)
-            return found.position
-
-        steps = [0.05 * step.reshape(1, 4) for step in np.eye(4)]
-        by_edges = np.stack([(position(boxes + s) - position(boxes - s)) / 0.1 for s in steps], -1)
-        exact = {name: Solid(SOLIDS[name].half_height, SOLIDS[name].form, 0) for name in names}
-        found = by_plane(detections(boxes, names), camera, exact, pixels=2.0)
-        np.testing.assert_allclose(found.covariance, 4 * by_edges @ by_edges.transpose(0, 2, 1), rtol=1e-2, atol=1e-10)
-
-        by_height = (position(raised=1e-4) - position(raised=-1e-4)) / 2e-4
-        spread = {name: Solid(SOLIDS[name].half_height, SOLIDS[name].form, 0.003) for name in names}
-        found = by_plane(detections(boxes, names), camera, spread, pixels=1e-3)
-        expected = 9e-6 * by_height[:, :, None] * by_height[:, None]
-        np.testing.assert_allclose(found.covariance, expected, rtol=1e-2, atol=1e-10)
-
-        scale = np.array([1, 1, 1, 1, 0.01, 0.01, 1e-3, 1e-3, 0.01, *[1e-3] * 6])
-        by_camera = np.stack(
-            [
-                (position(camera=camera.disturbed(s)) - position(camera=camera.disturbed(-s))) / 0.1
-                for s in 0.05 * np.diag(scale)
-            ],
-            -1,
-        )
-        known = camera.replace(covariance=np.diag(scale**2))
-        found = by_plane(detections(boxes, names), known, exact, pixels=1e-3)
-        np.testing.assert_allclose(found.covariance, by_camera @ by_camera.transpose(0, 2, 1), rtol=1e-2, atol=1e-9)
+def test_several_cameras_triangulate(scene):
+    found, cameras, _ = scene
+    options = {"box_std": 2.0, "workspace": within_distance(0.1, 0.25)}
+    expected = by_views(found[:2], cameras[:2], SOLIDS, **options)
+    assert_same(locate(found[:2], cameras[:2], SOLIDS, table_height=0.5, **options), expected)
+    matches = np.array([[0, 0], [2, 2]])
+    some = locate(found[:2], cameras[:2], SOLIDS, matches=matches, **options)
+    assert_same(some, by_views(found[:2], cameras[:2], SOLIDS, matches, **options))
+    assert some.position.shape == (2, 3)
 
 
-def test_every_thing_without_a_position_has_a_reason():
-    """A camera that looks to the horizon, and boxes all over its picture."""
-    level = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-    tilted = level @ cv2.Rodrigues(np.array([np.deg2rad(-15), 0, 0]))[0]
-    camera = camera_at(tabletop.pose(tilted, [0, 0, 0.4]))
-    cases = [
-        ("cube", [300, 400, 330, 430], ""),
-        ("cup", [300, 400, 330, 430], "no height is known of cup"),
-        ("cube", [300, 400, 300, 430], "its box is empty"),
-        ("cube", [0, 400, 30, 430], "the picture's edge cuts it off"),
-        ("cube", [300, 460, 330, 480], "the picture's edge cuts it off"),
-        ("cube", [300, 90, 330, 120], "the line of sight does not meet the table"),  # The horizon, and above it.
-        ("cube", [300, 20, 330, 50], "the line of sight does not meet the table"),
-        ("tower", [300, 400, 330, 405], "nothing of the height of tower on the table explains its box"),
-        ("cube", [300, 200, 330, 230], "outside the workspace"),
-    ]
-    names = (*NAMES, "cup")
-    ids = [names.index(name) for name, _, _ in cases]
-    found = Detections([edges for _, edges, _ in cases], np.linspace(0.9, 0.5, len(cases)), ids, names)
-    located = by_plane(found, camera, SOLIDS, workspace=lambda points: points[:, 0] < 1)
-    assert list(located.reasons) == [reason for _, _, reason in cases]
-    lost = np.array([bool(reason) for reason in located.reasons])
-    assert np.isnan(located.position[lost]).all() and np.isnan(located.covariance[lost]).all()
-    assert np.isfinite(located.position[~lost]).all() and np.isfinite(located.covariance[~lost]).all()
-    first, second, *_ = located.rows()
-    assert first["reason"] is None and first["position"] == located.position[0].tolist() and first["confidence"] == 0.9
-    assert second["position"] is None and second["covariance"] is None and second["class_name"] == "cup"
-    # k1 = -0.3 alone reaches no further than 0.70 from the middle of the image plane at depth 1.
-    barrel = camera.replace(distortion=np.array([-0.3, 0, 0, 0]), matrix=camera.matrix * [[0.5], [0.5], [1]])
-    edge = by_plane(Detections([[600, 400, 630, 430]], [0.9], [0], ("cube",)), barrel, SOLIDS)
-    assert edge.reasons == ("the lens model shows nothing there",)
-    upwards = camera_at(tabletop.pose(np.diag([1.0, -1, -1]) @ np.diag([1, -1, -1]), [0, 0, 0.4]))
-    away = by_plane(Detections([[300, 200, 330, 230]], [0.9], [0], ("cube",)), upwards, SOLIDS)
-    assert away.reasons == ("the line of sight does not meet the table",)
+def test_what_does_not_go_together_is_refused(scene):
+    found, cameras, depth = scene
+    with pytest.raises(UserError, match="a depth image goes with one camera"):
+        locate(found[:2], cameras[:2], SOLIDS, depth=depth)
+    with pytest.raises(UserError, match="2 cameras and 1 lists of detections: give two or more of each"):
+        locate(found[0], cameras[:2], SOLIDS)
+    with pytest.raises(UserError, match="1 cameras and 2 lists of detections"):
+        locate(found[:2], cameras[0], SOLIDS)
+    with pytest.raises(UserError, match="1 cameras and 1 lists of detections"):
+        locate(found[0], cameras[0], SOLIDS, matches=np.zeros((1, 1)))
+    with pytest.raises(UserError, match="must be said for three cameras and more"):
+        locate(found, cameras, SOLIDS)
+    with pytest.raises(UserError, match="the camera has no extrinsics: calibrate its pose first"):
+        locate(found[0], cameras[0].replace(has_extrinsics=False), SOLIDS)
 
 
-def test_any_number_of_things_and_heights_as_plain_numbers():
-    rng = np.random.default_rng(4)
-    camera, names = camera_at(over_the_table(rng)), ["cube"] * 9
-    middles = on_the_table(rng, names)
-    boxes = ideal_boxes(camera, middles, np.full((9, 2), 0.015), names)
-    nine = by_plane(detections(boxes, names), camera, {"cube": 0.015}, table=0.0)
-    np.testing.assert_allclose(nine.position, middles, atol=1e-4)
-    one = by_plane(detections(boxes[:1], names[:1]), camera, {"cube": 0.015})
-    np.testing.assert_allclose(one.position, middles[:1], atol=1e-4)
-    none = by_plane(detections(np.zeros((0, 4)), []), camera, {"cube": 0.015})
-    assert none.position.shape == (0, 3) and none.covariance.shape == (0, 3, 3) and none.reasons == ()
-    # On a table that is higher, seen by a camera that is as much higher.
-    raised = camera.replace(position=camera.position + np.array([0, 0, 0.1]))
-    nine = by_plane(detections(boxes, names), raised, {"cube": 0.015}, table=0.1)
-    np.testing.assert_allclose(nine.position, middles + np.array([0, 0, 0.1]), atol=1e-4)
+def test_a_workspace_between_two_distances():
+    points = np.array([[0, 0, 0.1], [0.2, 0, 0], [0, -0.3, 0], [np.nan] * 3])
+    np.testing.assert_array_equal(within_distance(0.15, 0.25)(points), [False, True, False, False])
+    for distances in ((0.3, 0.1), (-1, 1), (0, 0), (np.nan, 1)):
+        with pytest.raises(UserError, match="needs its smallest distance and its largest"):
+            within_distance(*distances)
 
 
-def test_what_cannot_be_asked():
-    camera = camera_at(np.eye(4))
-    with pytest.raises(UserError, match="nobody has said where the camera stands: find its pose with"):
-        by_plane(detections(np.ones((1, 4)), ["cube"]), camera.replace(posed=False), SOLIDS)
-    for pixels in (0, -1, np.nan, np.inf):
-        with pytest.raises(UserError, match="a number of pixels above zero"):
-            by_plane(detections(np.ones((1, 4)), ["cube"]), camera, SOLIDS, pixels=pixels)
-    for half_height in (0, -1, np.nan, np.inf):
-        with pytest.raises(UserError, match="give metres above zero"):
-            Solid(half_height)
-    with pytest.raises(UserError, match="no form 'cube': choose from block, ball, cone"):
-        Solid(0.01, "cube")
+def test_the_example_holds():
+    result = doctest.testmod(localization)
+    assert result.attempted > 5 and not result.failed
+
+
+def test_importing_it_costs_nothing():
+    code = "import sys, arm5dof.vision.localization; print([m for m in ('jax', 'cv2', 'mujoco') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

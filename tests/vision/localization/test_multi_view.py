@@ -1,27 +1,35 @@
-"""Points and things seen by several cameras, against OpenCV's triangulation, scipy's least squares and MuJoCo."""
+"""Points and objects seen by several cameras, against OpenCV's triangulation, scipy's least squares and MuJoCo."""
 
 import cv2
 import jax
 import numpy as np
 import pytest
 from helpers import tabletop
-from helpers.tabletop import LENS, SOLIDS, camera_at, over_the_table
+from helpers.tabletop import (
+    LENS,
+    NAMES,
+    SOLIDS,
+    camera_at,
+    detections,
+    ideal_boxes,
+    on_the_table,
+    over_the_table,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import chi2
-from vision.localization.test_locate import NAMES, detections, ideal_boxes, on_the_table
 
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.localization.multi_view import by_views, match, triangulate
+from arm5dof.vision.localization.multi_view import by_views, match_views, triangulate
 
 SEEDS = st.integers(0, 2**32 - 1)
 
 
 def apart(rng, count=2, least=20):
-    """Poses of cameras that see the middle of the table from directions so many degrees apart."""
+    """Poses of cameras that see the center of the table from directions so many degrees apart."""
     while True:
         poses = [over_the_table(rng) for _ in range(count)]
         looks = np.array([pose[:3, 2] for pose in poses])
@@ -74,14 +82,14 @@ def test_what_is_projected_is_located_wherever_it_is(seed):
     """Things in the air, their boxes exact."""
     rng = np.random.default_rng(seed)
     names = list(rng.choice(NAMES, 8))
-    middles = on_the_table(rng, names) + rng.uniform(0, 0.1, (8, 1)) * [0, 0, 1]
+    centers = on_the_table(rng, names) + rng.uniform(0, 0.1, (8, 1)) * [0, 0, 1]
     with jax.enable_x64(True):
         cameras = [camera_at(pose) for pose in apart(rng)]
-        views = [detections(ideal_boxes(c, middles, rng.uniform(0.01, 0.03, (8, 2)), names), names) for c in cameras]
+        views = [detections(ideal_boxes(c, centers, rng.uniform(0.01, 0.03, (8, 2)), names), names) for c in cameras]
         found = by_views(views, cameras, SOLIDS, np.stack([np.arange(8)] * 2, 1))
-    assert all(reason in ("", "the picture's edge cuts it off") for reason in found.reasons)
-    seen = np.array([not reason for reason in found.reasons])
-    np.testing.assert_allclose(found.position[seen], middles[seen], atol=2e-6)
+    assert all(reason in ("", "the picture's edge cuts it off") for reason in found.failure)
+    seen = np.array([not reason for reason in found.failure])
+    np.testing.assert_allclose(found.position[seen], centers[seen], atol=2e-6)
 
 
 def test_what_mujoco_renders_is_located():
@@ -89,17 +97,17 @@ def test_what_mujoco_renders_is_located():
     errors, plain, cones = [], [], []
     for _ in range(12):
         names = list(rng.choice(NAMES, 4, replace=False))
-        model, data, middles = tabletop.table(rng, names, apart(rng, least=30))
+        model, data, centers = tabletop.table(rng, names, apart(rng, least=30))
         cameras = [Camera.from_mujoco(model, name, tabletop.WIDTH, tabletop.HEIGHT) for name in "01"]
         views = [detections(tabletop.boxes(model, tabletop.cast(model, data, c)[0], 4), names) for c in cameras]
         rows = np.stack([np.arange(4)] * 2, 1)
-        np.testing.assert_array_equal(match(tuple(views), tuple(cameras), limit=20), rows)
+        np.testing.assert_array_equal(match_views(tuple(views), tuple(cameras), limit=20), rows)
         found = by_views(views, cameras, SOLIDS)
-        assert not any(found.reasons)
+        assert not any(found.failure)
         points, _ = triangulate(tuple(cameras), np.stack([view.center for view in views], 1))
         cones += [name in ("cone", "pyramid") for name in names]
-        errors += [*np.linalg.norm(found.position - middles, axis=1)]
-        plain += [*np.linalg.norm(points - middles, axis=1)]
+        errors += [*np.linalg.norm(found.position - centers, axis=1)]
+        plain += [*np.linalg.norm(points - centers, axis=1)]
     errors, plain, cones = 1e3 * np.array(errors), 1e3 * np.array(plain), np.array(cones)
     assert np.median(errors) < 1 and np.percentile(errors, 95) < 3
     assert np.median(plain[~cones]) > 1.2 * np.median(errors[~cones]) and np.median(plain[cones]) > 5
@@ -111,15 +119,15 @@ def test_the_stated_covariance_is_that_of_the_errors():
     for _ in range(50):
         pairs = [tabletop.calibrated_and_posed(rng) for _ in range(2)]
         names = list(rng.choice(NAMES, 8))
-        middles = on_the_table(rng, names)
-        middles[:, 2] += 5e-4 * rng.normal(size=8)
+        centers = on_the_table(rng, names)
+        centers[:, 2] += 5e-4 * rng.normal(size=8)
         views = []
         for true, _ in pairs:
-            boxes = ideal_boxes(true, middles, rng.uniform(0.012, 0.025, (8, 2)), names, middles[:, 2])
+            boxes = ideal_boxes(true, centers, rng.uniform(0.012, 0.025, (8, 2)), names, centers[:, 2])
             views.append(detections(boxes + rng.normal(size=(8, 4)), names))
         found = by_views(views, [camera for _, camera in pairs], SOLIDS, np.stack([np.arange(8)] * 2, 1))
-        for i in np.flatnonzero([not reason for reason in found.reasons]):
-            error = found.position[i] - middles[i]
+        for i in np.flatnonzero([not reason for reason in found.failure]):
+            error = found.position[i] - centers[i]
             distance.append(error @ np.linalg.solve(found.covariance[i], error))
             errors.append(1e3 * np.linalg.norm(error))
     assert len(distance) > 300
@@ -129,46 +137,46 @@ def test_the_stated_covariance_is_that_of_the_errors():
 
 
 def test_boxes_are_matched_by_class_and_by_lines_of_sight():
-    """Four cubes and two balls, each camera giving its own confidences, one thing being seen by one camera only."""
+    """Four cubes and two balls, each camera giving its own confidences, one object being seen by one camera only."""
     rng = np.random.default_rng(3)
     names = ["cube", "cube", "ball", "cube", "ball", "cube"]
-    middles = np.array([[0.08 + 0.06 * i, 0.08 * j, SOLIDS["cube"].half_height] for i in range(3) for j in (-1, 1)])
-    middles[[2, 4], 2] = SOLIDS["ball"].half_height
+    centers = np.array([[0.08 + 0.06 * i, 0.08 * j, SOLIDS["cube"].half_height] for i in range(3) for j in (-1, 1)])
+    centers[[2, 4], 2] = SOLIDS["ball"].half_height
     cameras = tuple(camera_at(pose) for pose in apart(rng, least=30))
     orders = rng.permutation(6), rng.permutation(6)[:5]
     views = tuple(
-        detections(ideal_boxes(c, middles, np.full((6, 2), 0.015), names)[order], [names[i] for i in order])
+        detections(ideal_boxes(c, centers, np.full((6, 2), 0.015), names)[order], [names[i] for i in order])
         for c, order in zip(cameras, orders, strict=True)
     )
-    rows = match(views, cameras)
+    rows = match_views(views, cameras)
     pairs = {(int(orders[0][i]), int(orders[1][j])) for i, j in rows}
     assert pairs == {(int(i), int(i)) for i in orders[1]}
     found = by_views(views, cameras, SOLIDS)
     seen = np.isin(orders[0], orders[1])
-    np.testing.assert_allclose(found.position[seen], middles[orders[0]][seen], atol=1e-4)
+    np.testing.assert_allclose(found.position[seen], centers[orders[0]][seen], atol=1e-4)
     assert np.isnan(found.position[~seen]).all() and np.isnan(found.covariance[~seen]).all()
     alone = f"the other picture shows no {names[orders[0][~seen][0]]} there"
-    assert found.detections is views[0] and list(found.reasons) == ["" if both else alone for both in seen]
+    assert found.detections is views[0] and list(found.failure) == ["" if both else alone for both in seen]
     nothing = Detections(np.zeros((0, 4)), [], [], NAMES)
-    assert match((views[0], nothing), cameras).shape == (0, 2)
+    assert match_views((views[0], nothing), cameras).shape == (0, 2)
     assert by_views((nothing, nothing), cameras, SOLIDS).position.shape == (0, 3)
-    assert all(by_views((views[0], nothing), cameras, SOLIDS).reasons)
+    assert all(by_views((views[0], nothing), cameras, SOLIDS).failure)
 
 
 def test_three_views_and_every_reason():
     rng = np.random.default_rng(4)
     cameras = [camera_at(pose) for pose in apart(rng, 3)]
     names = ["cube", "can", "ball", "cube"]
-    middles = np.array([[0.1, 0.05, 0.015], [0.2, -0.05, 0.03], [0.15, 0.08, 0.018], [0.2, 0.02, 0.015]])
-    views = [detections(ideal_boxes(c, middles, np.full((4, 2), 0.015), names), names) for c in cameras]
+    centers = np.array([[0.1, 0.05, 0.015], [0.2, -0.05, 0.03], [0.15, 0.08, 0.018], [0.2, 0.02, 0.015]])
+    views = [detections(ideal_boxes(c, centers, np.full((4, 2), 0.015), names), names) for c in cameras]
     rows = np.stack([np.arange(4)] * 3, 1)
     three = by_views(views, cameras, SOLIDS, rows)
-    np.testing.assert_allclose(three.position, middles, atol=1e-4)
+    np.testing.assert_allclose(three.position, centers, atol=1e-4)
     two = by_views(views[:2], cameras[:2], SOLIDS, rows[:, :2])
     assert (np.trace(three.covariance, axis1=1, axis2=2) < np.trace(two.covariance, axis1=1, axis2=2)).all()
 
     def reasons(views, cameras, rows, **options):
-        return list(by_views(views, cameras, SOLIDS, np.array(rows), **options).reasons)
+        return list(by_views(views, cameras, SOLIDS, np.array(rows), **options).failure)
 
     mixed = "no one cube explains its boxes"
     assert reasons(views[:2], cameras[:2], [[0, 3], [1, 1], [3, 2]]) == [mixed, "", mixed]
@@ -179,11 +187,11 @@ def test_three_views_and_every_reason():
     edge = Detections([[0, 100, 30, 130]], [0.9], [NAMES.index("cube")], NAMES)
     assert reasons([views[0], edge], cameras[:2], [[0, 0]]) == ["the picture's edge cuts it off"]
     part = by_views(views[:2], cameras[:2], {"cube": 0.015}, rows[:, :2])
-    assert part.reasons == ("", "no height is known of can", "no height is known of ball", "")
+    assert part.failure == ("", "no height is known of can", "no height is known of ball", "")
 
     with pytest.raises(UserError, match="give two or more of each"):
         by_views(views[:1], cameras[:1], SOLIDS)
     with pytest.raises(UserError, match="must be said for three cameras and more"):
         by_views(views, cameras, SOLIDS)
-    with pytest.raises(UserError, match="nobody has said where the camera stands"):
-        by_views(views[:2], [cameras[0], cameras[1].replace(posed=False)], SOLIDS)
+    with pytest.raises(UserError, match="the camera has no extrinsics"):
+        by_views(views[:2], [cameras[0], cameras[1].replace(has_extrinsics=False)], SOLIDS)

@@ -1,0 +1,128 @@
+"""Views of a board: its corners in photographs, and what its pose was in each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from arm5dof.errors import UserError
+from arm5dof.vision.calibration.boards import Board, Corners
+from arm5dof.vision.calibration.poses import pose_matrix
+from arm5dof.vision.camera import Camera
+
+MIN_VIEWS = 5
+"""Different views that a calibration takes. OpenCV's 13 photographs give the focal length to 0.1 % from any five of
+them, and to between 0.1 and 2 % from two or three."""
+
+
+class BoardView(NamedTuple):
+    """A board in a photograph."""
+
+    name: str
+    corners: Corners
+
+
+class BoardViews(NamedTuple):
+    """What was found in a set of photographs."""
+
+    found: list[BoardView]
+    without: list[str]
+    """Names of the photographs in which the board was not found."""
+    size: tuple[int, int]
+    """Width and height of every photograph, pixels."""
+
+
+def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str], object] | None = None) -> BoardViews:
+    """Look for the board in photographs.
+
+    Args:
+        paths: Image files.
+        board: What they show.
+        progress: Is told how many are done, and the name of the last.
+
+    Returns:
+        Its corners in each of them.
+
+    Raises:
+        BoardNotFoundError: They show another board, or none.
+        UserError: They cannot be read, differ in size, or too few show the board.
+        OSError: They cannot be read.
+    """
+    sizes: dict[str, tuple[int, int]] = {}
+    found, without, notes = [], [], []
+    for i, (path, name) in enumerate(zip(paths, image_names(paths), strict=True)):
+        gray = read_gray(path)
+        sizes[name] = gray.shape[1], gray.shape[0]
+        corners = board.find(gray)
+        notes.append(board.inspect(gray, corners))
+        if corners is None:
+            without.append(name)
+        else:
+            found.append(BoardView(name, corners))
+        if progress is not None:
+            progress(i + 1, name)
+    size = _one_size(sizes)
+    summary = f"{len(found)} of {len(paths)} photographs show the {board}"
+    board.check_inspected(notes, summary)
+    if len(found) < MIN_VIEWS:
+        hint = "; in the others it is not seen whole, with a white margin and in focus" if without else ""
+        raise UserError(
+            f"{summary} and a calibration takes {MIN_VIEWS}, from different sides, tilted, near and far{hint}"
+        )
+    return BoardViews(found, without, size)
+
+
+def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
+    """The pose of a board from one photograph.
+
+    Args:
+        camera: What took it; its extrinsics do not matter.
+        corners: What it shows of the board.
+
+    Returns:
+        Board to camera frame, (4, 4), metres.
+    """
+    lens = camera.opencv
+    # A flat board has two poses that look alike; the first is the one with the smaller error.
+    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, corners.pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
+    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, *lens, turns[0], shifts[0])
+    return pose_matrix(cv2.Rodrigues(turn)[0], shift.ravel())
+
+
+def board_error(camera: Camera, corners: Corners) -> float:
+    """Root mean square reprojection error of a view with the best pose, pixels."""
+    pose = board_pose(camera, corners)
+    turn, _ = cv2.Rodrigues(pose[:3, :3])
+    pixels, _ = cv2.projectPoints(corners.points, turn, pose[:3, 3], *camera.opencv)
+    return float(np.sqrt(np.square(pixels[:, 0] - corners.pixels).sum(-1).mean()))
+
+
+def _one_size(sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
+    (size, _), *more = Counter(sizes.values()).most_common()
+    if more:
+        others = [f"{name} ({w}x{h})" for name, (w, h) in sizes.items() if (w, h) != size]
+        raise UserError(
+            f"the photographs differ in size: most have {size[0]}x{size[1]} pixels, but not {', '.join(others[:10])}; "
+            "leave those out, or calibrate each size by itself"
+        )
+    return size
+
+
+def image_names(paths: Sequence[Path]) -> list[str]:
+    """File names, with their folders where two are the same."""
+    count = Counter(path.name for path in paths)
+    return [path.name if count[path.name] == 1 else str(path) for path in paths]
+
+
+def read_gray(path: Path) -> np.ndarray:
+    """A photograph in gray, (h, w), uint8. Raises `UserError` if it is none."""
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    gray = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    if gray is None:
+        raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
+    return gray

@@ -1,0 +1,94 @@
+"""Where objects stand on the table, from one image."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from arm5dof.vision.camera import Array, Camera
+from arm5dof.vision.detections import Detections
+from arm5dof.vision.localization.box_fit import box_center, camera_errors, fit_box, independent, propagate
+from arm5dof.vision.localization.common import (
+    MAX_RMS,
+    NOTHING_SEEN,
+    Localization,
+    ObjectBatch,
+    Solids,
+    Workspace,
+    batched,
+    check_inputs,
+    detection_problems,
+)
+
+MIN_SINE = np.sin(np.deg2rad(5))
+"""Lines of sight must meet the table at 5 degrees: at less, a pixel is worth centimetres."""
+
+
+def by_plane(
+    detections: Detections,
+    camera: Camera,
+    solids: Solids,
+    *,
+    table_height: float = 0.0,
+    box_std: float = 1.0,
+    workspace: Workspace | None = None,
+) -> Localization:
+    """Where objects of known height stand on a table, from one image.
+
+    Args:
+        detections: What was detected in the image.
+        camera: What took it, with extrinsics.
+        solids: What is known of the classes, by name.
+        table_height: Of the table in the base frame, metres.
+        box_std: Standard deviation of each edge of a box, pixels.
+        workspace: Says which positions count.
+
+    Returns:
+        A position and its covariance for each detection, base frame, or why there is none.
+
+    Raises:
+        UserError: The camera has no extrinsics, or `box_std` is not above zero.
+    """
+    check_inputs(camera, box_std)
+    objects = ObjectBatch.of(detections.xyxy, detections.data["class_name"], solids)
+    position, covariance, rms, sine = batched(_by_plane, objects, camera, table_height, box_std)
+    problems = [
+        *detection_problems(detections, camera, solids),
+        (np.isnan(sine), NOTHING_SEEN),
+        (sine < MIN_SINE, "the line of sight does not meet the table"),
+        (~(rms < MAX_RMS * box_std), "nothing of the height of {name} on the table explains its box"),
+    ]
+    return Localization.of(detections, position, covariance, problems, workspace)
+
+
+@jax.jit
+def _by_plane(objects: ObjectBatch, camera: Camera, table_height: float, box_std: float) -> tuple[jax.Array, ...]:
+    """Positions (n, 3), covariances (n, 3, 3), reprojection errors (n,) in pixels, and sines (n,) as of `on_plane`."""
+
+    def one(seen: ObjectBatch) -> tuple[jax.Array, ...]:
+        start, sine = on_plane(camera, seen.boxes, table_height + seen.half_height)
+
+        def estimate(box: jax.Array, error: jax.Array, half_height: jax.Array) -> tuple[jax.Array, Any]:
+            cameras = [camera.perturbed(error)]
+            fit = fit_box(cameras, box[None], half_height[0], seen.form, start, table_height, box_std)
+            return fit.center, (fit.center, fit.reprojection_rms)
+
+        inputs = [
+            independent(seen.boxes, box_std),
+            camera_errors(camera),
+            independent(seen.half_height[None], seen.std),
+        ]
+        covariance, (center, rms) = propagate(estimate, inputs)
+        return center, covariance, rms, sine
+
+    return jax.vmap(one)(objects)
+
+
+def on_plane(camera: Camera, box: Array, height: Array) -> tuple[jax.Array, jax.Array]:
+    """Where the line of sight through the center of a box (4,) meets the horizontal plane at a height in the base
+    frame, (3,), metres, and the sine of the angle between them: negative if it leads away, NaN if there is none."""
+    ray, away = camera.rays(box_center(box)), height - camera.position[2]
+    return jnp.asarray(camera.position) + ray * away / ray[2], ray[2] * jnp.sign(away)
