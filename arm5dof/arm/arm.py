@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,8 +46,8 @@ class Arm:
     >>> arm = load_arm("reach.xml")
     >>> arm.joint_names
     ('theta_1', 'theta_2', 'theta_3', 'theta_4', 'theta_5')
-    >>> arm.forward(arm.home).round(3).tolist()  # metres
-    [0.0, -0.029999999329447746, 0.3100000023841858]
+    >>> [round(1e3 * float(x)) for x in arm.forward(arm.home)]  # millimetres
+    [0, -30, 310]
     """
 
     mj_model: mujoco.MjModel
@@ -128,7 +128,13 @@ class Arm:
         joints = self._joints(q)
         return jnp.stack([self._point(joints, k) for k in range(self.dof)], axis=-2)
 
+    def _check(self, name: str, values: Any) -> None:
+        """Raise `UserError` if an array's last axis does not have a number for each joint."""
+        if np.shape(values)[-1:] != (self.dof,):
+            raise UserError(f"{name} takes a number for each of {self.dof} joints, not shape {np.shape(values)}")
+
     def _joints(self, q: jax.Array) -> Joints:
+        self._check("q", q)
         # The gradient of a split is one concatenation, that of indexing a sum of padded arrays.
         q = jnp.asarray(q)
         split = lambda x: [v[..., 0] for v in jax.lax.split(x, (1,) * self.dof, axis=x.ndim - 1)]
@@ -168,14 +174,17 @@ class Arm:
 
     def to_joints(self, action: jax.Array) -> jax.Array:
         """Map actions in [-1, 1] to joint positions inside the limits; (..., dof) to (..., dof)."""
+        self._check("action", action)
         return self.home + action * (self.upper - self.lower) / 2
 
     def to_ctrl(self, q: jax.Array) -> jax.Array:
         """What to tell the position actuators so that the joints come to rest at `q`; (..., dof) to (..., dof)."""
+        self._check("q", q)
         return self.servo[:, 0] * q + self.servo[:, 1]
 
     def to_action(self, q: jax.Array) -> jax.Array:
         """The inverse of `to_joints`."""
+        self._check("q", q)
         return (q - self.home) * 2 / (self.upper - self.lower)
 
     def sample(self, key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:

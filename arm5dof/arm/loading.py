@@ -28,6 +28,13 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = "e
     Raises:
         UserError: The file is missing or broken, the site does not exist, or the joints between the world and the
             site are not a chain of limited hinges and slides.
+
+    >>> from arm5dof import load_arm
+    >>> load_arm("arm7.xml").dof
+    7
+    >>> load_arm("arm7.xml", site="flange")
+    Traceback (most recent call last):
+    arm5dof.errors.UserError: the model has no site 'flange' to use as end effector; it has: ee
     """
     spec, model = _compile(source)
     names = [model.site(i).name for i in range(model.nsite)]

@@ -316,15 +316,16 @@ class CorrectionState(NamedTuple):
 
 
 def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
-    """What people state as rows of finite numbers, (n, k). Raises `UserError` for anything else."""
+    """What people state, rows of finite numbers (n, k) or one (k,), as rows. Raises `UserError` for anything else."""
     shape = f"{len(components)} numbers ({', '.join(components)}), or rows of them"
     try:
         array = np.asarray(values, float)
     except (TypeError, ValueError):
         raise UserError(f"{name} takes {shape}, not {values!r}") from None
-    if array.ndim != 2 or array.shape[1] != len(components) or not len(array):
+    if array.ndim not in (1, 2) or array.shape[-1] != len(components) or not len(array):
         raise UserError(f"{name} takes {shape}, not an array of shape {array.shape}")
-    for i, row in enumerate(array, 1):
+    rows = np.atleast_2d(array)
+    for i, row in enumerate(rows, 1):
         if not np.isfinite(row).all():
             raise UserError(f"{name} {i} is not finite: {' '.join(map(str, row.tolist()))}")
-    return array
+    return rows

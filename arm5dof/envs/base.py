@@ -71,7 +71,34 @@ class Env(Protocol):
 
 class Task(ABC):
     """An environment that can be trained from a TOML file. Inherit from it, and write `Config` (a class decorated with
-    `arm5dof.settings.settings`), `action_size`, `reset` and `step` as `Env` has them; the rest has defaults."""
+    `arm5dof.settings.settings`), `action_size`, `reset` and `step` as `Env` has them; the rest has defaults.
+
+    >>> import jax
+    >>> import jax.numpy as jnp
+    >>> from arm5dof import Task
+    >>> from arm5dof.envs import State
+    >>> from arm5dof.settings import settings, static
+    >>> @settings
+    ... class PushConfig:
+    ...     episode_length: int = static(default=50)
+    >>> class Push(Task):
+    ...     "Push a point from anywhere on a line to 0."
+    ...     Config = PushConfig
+    ...     action_size = 1
+    ...
+    ...     def reset(self, key):
+    ...         return self._state(jax.random.uniform(key, minval=-1.0, maxval=1.0))
+    ...
+    ...     def step(self, state, action):
+    ...         return self._state(state.data + 0.1 * action[0])
+    ...
+    ...     def _state(self, x):
+    ...         return State(x, {"state": x[None], "privileged_state": x[None]}, -jnp.abs(x), jnp.zeros(()), {}, {})
+    >>> push = Push(PushConfig())
+    >>> state = push.step(push.reset(jax.random.key(0)), jnp.ones(1))
+    >>> state.obs["state"].shape, push.episode_length
+    ((1,), 50)
+    """
 
     Config: ClassVar[type]
     """The task's settings, the section `[env]` of a TOML file. One of them is `episode_length`."""
@@ -176,8 +203,8 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     def goals(self, **inputs: np.ndarray) -> Goal:
-        """Goals with a leading axis (n,) from what people state, arrays (n, k) by the names of `goal_inputs`. Raises
-        `UserError` for what is no goal."""
+        """Goals with a leading axis (n,) from what people state by the names of `goal_inputs`: rows (n, k) or one row
+        (k,). Raises `UserError` for what is no goal."""
         ...
 
     def question(self, goal: Goal) -> Observation:

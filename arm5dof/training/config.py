@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import functools
 import importlib
 import importlib.util
 import sys
@@ -28,7 +29,13 @@ from arm5dof.training.trainer import TrainConfig
 
 @dataclass(frozen=True)
 class Config:
-    """A run: the task and its settings, the agent, the budget and the accuracy protocol."""
+    """A run: the task and its settings, the agent, the budget and the accuracy protocol.
+
+    >>> from arm5dof import load_config
+    >>> config = load_config("kinematic.toml", seed=3)
+    >>> config.task, config.train.seed, config.flat()["ddpg.heads"]
+    ('reach', 3, 8)
+    """
 
     task: str
     """The name of a task that ships, or `package.module:Class`."""
@@ -256,6 +263,7 @@ def _import(module: str, folder: Path | None) -> Any:
     return importlib.import_module(module)
 
 
+@functools.cache
 def _descriptions(cls: type) -> dict[str, tuple[str, list[str] | None]]:
     """What is said of each field, and its choices if it has some."""
     described: dict[str, tuple[str, list[str] | None]] = {}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -17,13 +18,16 @@ from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
 
 
-class Policy(struct.PyTreeNode):
+class Policy(struct.PyTreeNode, eq=False):
     """A trained policy for one task. A pytree whose leaves are the networks and the agent's numbers.
 
     >>> from arm5dof import Run
-    >>> policy = Run.open("runs/reach").policy()  # doctest: +SKIP
-    >>> policy.solve([0.15, 0.05, 0.12], corrections=10).q  # doctest: +SKIP
-    Array([0.39, 0.12, 1.71, -1.45, 0.33], dtype=float32)
+    >>> policy = Run.open("runs/short").policy()
+    >>> answer = policy.solve([0.15, 0.05, 0.12], corrections=10)
+    >>> answer.q.shape  # radians
+    (5,)
+    >>> answer.outcome.shape, answer.errors["distance"].shape  # metres
+    ((3,), ())
     """
 
     env: Task = struct.field(pytree_node=False)
@@ -35,19 +39,24 @@ class Policy(struct.PyTreeNode):
         """The policy's actions.
 
         Args:
-            obs: Observations, a dictionary of arrays (n, size) as `State.obs` has them.
+            obs: Observations as `State.obs` has them, a dictionary of arrays (n, size), or (size,) for one.
             branch: Which of the actor's heads is to answer, (n,) int32; without it the one the critic prefers.
 
         Returns:
-            Actions, (n, action_size) in [-1, 1].
+            Actions, (n, action_size) in [-1, 1]; (action_size,) for one observation.
+
+        Raises:
+            UserError: These are no observations of the policy's task.
         """
-        if not isinstance(obs, dict):
-            raise UserError("a policy acts on observations, dictionaries of arrays: for joint angles use solve")
+        if _is_single(self.env, obs):
+            return self(*jax.tree.map(lambda x: jnp.asarray(x)[None], (obs, branch)))[0]
         branch = self.branch(obs) if branch is None else branch
         return self.agent.answer(self.networks.actor, obs, branch)
 
     def branch(self, obs: Observation) -> jax.Array:
         """Which of the actor's heads the critic prefers, (n,) int32, for observations as in a call."""
+        if _is_single(self.env, obs):
+            return self.branch(jax.tree.map(lambda x: jnp.asarray(x)[None], obs))[0]
         return self.agent.head(self.config, self.networks.actor, self.networks.critic, obs)
 
     @property
@@ -78,13 +87,17 @@ class Policy(struct.PyTreeNode):
         names = list(model.goal_inputs)
         given = {**dict(zip(names, target, strict=False)), **inputs}
         if len(target) > len(names) or set(given) != set(names) or set(inputs) & set(names[: len(target)]):
-            raise UserError(f"solve takes {' and '.join(names)} for this task, each once")
-        if corrections < 0:
-            raise UserError(f"corrections = {corrections} is negative")
-        single = np.ndim(given[names[0]]) == 1
-        goals = model.goals(**{k: np.asarray(v)[None] if single and np.ndim(v) == 1 else v for k, v in given.items()})
+            wanted = " and ".join(f"{name} ({', '.join(parts)})" for name, parts in model.goal_inputs.items())
+            stated = [*names[: len(target)], *inputs, *target[len(names) :]]
+            raise UserError(
+                f"solve takes {wanted} for this task, each once, not {', '.join(map(str, stated)) or 'nothing'}"
+            )
+        if not isinstance(corrections, (int, np.integer)) or corrections < 0:
+            raise UserError(f"corrections = {corrections!r}: it should be a whole number, 0 or more")
+        goals = model.goals(**given)
         if len({len(leaf) for leaf in jax.tree.leaves(goals)}) > 1:
             raise UserError(f"solve takes as many of each of {' and '.join(names)}")
+        single = all(np.ndim(values) == 1 for values in given.values())
         answer = _solve(model, self, goals, corrections)
         return jax.tree.map(lambda x: x[0], answer) if single else answer
 
@@ -111,3 +124,25 @@ class Policy(struct.PyTreeNode):
 def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
     return solve(env, policy, goals, corrections)
+
+
+def _is_single(env: Task, obs: Any) -> bool:
+    """Whether that is one observation of a task, rather than a batch of them. Raises `UserError` if it is neither."""
+    sizes = _observation_sizes(env)
+    wanted = " and ".join(f"{name} ({size},)" for name, size in sizes.items())
+    if not isinstance(obs, dict) or obs.keys() != sizes.keys():
+        found = ", ".join(map(str, obs)) if isinstance(obs, dict) else type(obs).__name__
+        raise UserError(f"a policy acts on observations, a dictionary of {wanted}, not {found}; for goals use solve")
+    shapes = {name: np.shape(value) for name, value in obs.items()}
+    batches = {shape[:-1] for shape in shapes.values()}
+    if any(shapes[name][-1:] != (size,) for name, size in sizes.items()) or len(batches) > 1 or len(min(batches)) > 1:
+        found = " and ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise UserError(f"this policy acts on {wanted}, or (n, size) for n observations, not {found}")
+    return batches == {()}
+
+
+@cache
+def _observation_sizes(env: Task) -> dict[str, int]:
+    """The sizes of a task's observations, by name."""
+    obs = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0))).obs
+    return {name: value.shape[-1] for name, value in obs.items()}

@@ -61,7 +61,15 @@ class Silent:
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """One run's folder and configuration."""
+    """One run's folder and configuration.
+
+    >>> from arm5dof import Run
+    >>> run = Run.open("runs/short")
+    >>> run.evaluations[-1]["episodes"], run.metrics["env_steps"][-1]
+    (2, 320.0)
+    >>> sorted(run.evaluate(targets=100)["one_shot"]["within"])  # shares within millimetres
+    ['1', '10', '20', '5']
+    """
 
     folder: Path
     config: Config
@@ -184,6 +192,12 @@ def train(settings: Config, folder: str | Path | None = None, reporter: Reporter
 
     Raises:
         UserError: The configuration cannot be trained, or the folder exists.
+
+    >>> from arm5dof import load_config, train
+    >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 100}
+    >>> run = train(load_config("kinematic.toml", updates_per_step=1, **budget), "runs/short")
+    >>> (run.folder / "report.md").exists()
+    True
     """
     made = make_trainer(settings)  # What is wrong with the robot or the budget is said before a folder exists.
     run = Run.create(settings, folder or free_folder(settings.task.rpartition(":")[2]), made.env)

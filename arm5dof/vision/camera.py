@@ -32,6 +32,14 @@ class Camera(struct.PyTreeNode):
 
     They compute in float32, or in float64 under `jax.enable_x64(True)`. Arrays read from a file stay float64 NumPy
     arrays until then, so nothing is lost on the way from file to file.
+
+    >>> import numpy as np
+    >>> from arm5dof import Camera
+    >>> matrix = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
+    >>> looks_down = np.diag([1.0, -1.0, -1.0])
+    >>> camera = Camera(matrix, np.zeros(5), looks_down, np.array([0.2, 0, 0.6]), width=640, height=480)
+    >>> camera.project(np.array([0.2, 0.1, 0.0])).round(3).tolist()  # pixels
+    [319.5, 139.5]
     """
 
     matrix: Array

@@ -18,6 +18,11 @@ class Detections:
     """Boxes in an image, the most confident first. The fields are named as in the `supervision` library.
 
     Raises `ValueError` for arrays of different lengths, values that are not finite, and unknown class ids.
+
+    >>> from arm5dof import Detections
+    >>> found = Detections([[300, 220, 340, 260], [10, 20, 50, 80]], [0.6, 0.9], [0, 1], ("cup", "ball"))
+    >>> len(found), found.xyxy[0].tolist(), found.class_names[found.class_id[0]]
+    (2, [10.0, 20.0, 50.0, 80.0], 'ball')
     """
 
     xyxy: np.ndarray
