@@ -13,6 +13,7 @@ import hashlib
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,15 +31,23 @@ KEEP = 2
 class Checkpoints:
     """The checkpoints of one run, in one folder, numbered by the steps taken.
 
-    `settings` are those that shape what is kept, by name: a checkpoint made with others is refused. Only the process
-    that trains the run may open them for writing: it clears away what a killed one left unfinished.
+    `settings` are those that shape what is kept, by name: a checkpoint made with others is refused. Those of `budget`
+    may change, and `check` says which did. Only the process that trains the run may open them for writing: it clears
+    away what a killed one left unfinished.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], read_only: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: Mapping[str, Any],
+        budget: Mapping[str, Any] | None = None,
+        read_only: bool = False,
+    ) -> None:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
         self.folder = folder
         self._settings = dict(settings)
+        self._budget = dict(budget or {})
         logging.getLogger("absl").setLevel(logging.CRITICAL)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=KEEP,
@@ -60,7 +69,8 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
-        record = {**{name: _describe(leaves) for name, leaves in items.items()}, "settings": self._settings}
+        record = {name: _describe(leaves) for name, leaves in items.items()}
+        record |= {"settings": self._settings, "budget": self._budget}
         failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, resume from that"
         with _as_user_error(failure):
             self._manager.save(
@@ -81,23 +91,28 @@ class Checkpoints:
         """The networks of the newest checkpoint."""
         return self._read("networks", like)
 
+    def check(self) -> dict[str, tuple[Any, Any]]:
+        """Raise `UserError` if the newest checkpoint, where there is one, was made with other settings or is damaged.
+        Returns what of the budget has changed since: from what to what, by name."""
+        before = {} if self.latest is None else self._record(self.latest).get("budget", {})
+        now = self._budget
+        return {name: (before[name], now[name]) for name in before if name in now and before[name] != now[name]}
+
     def _read(self, item: str, like: T) -> T:
         import orbax.checkpoint as ocp
 
         step = self.latest
         if step is None:
             raise UserError(f"{self.folder} holds no complete checkpoint yet")
-        where = self.folder / str(step)
         template = {name: _storable(leaf) for name, leaf in _named(like).items() if leaf.size}
         abstract = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in template.items()}
-        with _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one"):
-            records = self._manager.restore(step, args=ocp.args.Composite(record=ocp.args.JsonRestore())).record
-            self._check(where, records.get("settings"))
-            record = records[item]
+        with self._damage(step):
+            record = self._record(step)[item]
             expected = {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in abstract.items()}
             if expected != record["leaves"]:
                 raise UserError(
-                    f"the checkpoint {where} does not fit the run's config.toml: it is of another run or version"
+                    f"the checkpoint {self.folder / str(step)} does not fit the run's config.toml: it is of another "
+                    "run or version"
                 )
             restored = self._manager.restore(
                 step, args=ocp.args.Composite(**{item: ocp.args.StandardRestore(abstract)})
@@ -106,8 +121,14 @@ class Checkpoints:
                 raise ValueError("its contents do not match their digest")
         return _rebuild(like, restored)
 
-    def _check(self, where: Path, made_with: Mapping[str, Any] | None) -> None:
-        """Raise `UserError` if a checkpoint was made with other settings."""
+    def _record(self, step: int) -> dict[str, Any]:
+        """What a checkpoint says of itself. Raises `UserError` if it was made with other settings."""
+        import orbax.checkpoint as ocp
+
+        where = self.folder / str(step)
+        with self._damage(step):
+            record = self._manager.restore(step, args=ocp.args.Composite(record=ocp.args.JsonRestore())).record
+            made_with = record.get("settings")
         if made_with is None:
             raise UserError(f"the checkpoint {where} is of an older version: train the run anew")
         names = [*made_with, *(name for name in self._settings if name not in made_with)]
@@ -116,6 +137,12 @@ class Checkpoints:
             raise UserError(
                 f"the checkpoint {where} was made with other settings ({told}): set them back in config.toml"
             )
+        return dict(record)
+
+    def _damage(self, step: int) -> AbstractContextManager[None]:
+        """What is said of a checkpoint that cannot be read."""
+        where = self.folder / str(step)
+        return _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one")
 
 
 def _named(tree: Any) -> dict[str, Any]:

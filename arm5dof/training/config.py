@@ -60,15 +60,19 @@ SECTIONS = ("env", "ddpg", "train", "evaluate")
 
 
 def fixed(config: Config) -> dict[str, Any]:
-    """The settings that shape a run's networks and what they have learnt, by full name: all but those that may change
-    before it is resumed."""
-    may = [
-        f"{section}.{f.name}"
+    """The settings that shape a run's networks and what they have learnt, by full name."""
+    others = may_change(config)
+    return {name: value for name, value in config.flat().items() if name not in others}
+
+
+def may_change(config: Config) -> dict[str, Any]:
+    """The settings that may change before a run is resumed, by full name."""
+    return {
+        f"{section}.{f.name}": getattr(getattr(config, section), f.name)
         for section in SECTIONS
         for f in dataclasses.fields(getattr(config, section))
         if f.metadata.get("may_change")
-    ]
-    return {name: value for name, value in config.flat().items() if name not in may}
+    }
 
 
 class Field(NamedTuple):

@@ -21,13 +21,17 @@ from arm5dof.runtime.tables import Table
 class Policy(struct.PyTreeNode, eq=False):
     """A trained policy for one task. A pytree whose leaves are the networks and the agent's numbers.
 
-    >>> from arm5dof import Run
-    >>> policy = Run.open("runs/short").policy()
+    >>> import tempfile
+    >>> from arm5dof import load_config, train
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 100}
+    >>> config = load_config("kinematic.toml", updates_per_step=1, **budget)  # Seconds, and far from enough.
+    >>> policy = train(config, f"{folder.name}/short").policy()
     >>> answer = policy.solve([0.15, 0.05, 0.12], corrections=10)
-    >>> answer.q.shape  # radians
-    (5,)
-    >>> answer.outcome.shape, answer.errors["distance"].shape  # metres
-    ((3,), ())
+    >>> answer.q.shape, answer.outcome.shape, answer.errors["distance"].shape  # radians, metres, metres
+    ((5,), (3,), ())
+    >>> policy.solve([[0.15, 0.05, 0.12], [0.1, -0.1, 0.2]]).q.shape
+    (2, 5)
     """
 
     env: Task = struct.field(pytree_node=False)

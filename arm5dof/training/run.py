@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import gzip
-import hashlib
 import json
 import time
 import tomllib
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,14 +20,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import jax
-import mujoco
-import numpy as np
 
 from arm5dof.envs import Task
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.runtime.tables import Table
-from arm5dof.training import config, evaluate, report, trainer
+from arm5dof.training import config, evaluate, report, robot, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import Config, make_env
 from arm5dof.training.policy import Policy
@@ -63,12 +58,12 @@ class Silent:
 class Run:
     """One run's folder and configuration.
 
-    >>> from arm5dof import Run
-    >>> run = Run.open("runs/short")
-    >>> run.evaluations[-1]["episodes"], run.metrics["env_steps"][-1]
-    (2, 320.0)
-    >>> sorted(run.evaluate(targets=100)["one_shot"]["within"])  # shares within millimetres
-    ['1', '10', '20', '5']
+    >>> import tempfile
+    >>> from arm5dof import Run, load_config
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> run = Run.create(load_config("kinematic.toml", seed=3), f"{folder.name}/begun")
+    >>> Run.open(f"{folder.name}/begun").config.train.seed, run.env.action_size, run.evaluations
+    (3, 5, [])
     """
 
     folder: Path
@@ -90,7 +85,7 @@ class Run:
         env = env or make_env(settings)
         with files.making(folder) as temporary:
             (temporary / "config.toml").write_text(config.dumps(settings), encoding="utf-8")
-            model = _keep_model(temporary, env)
+            model = robot.keep(temporary, env)
             versions = {name: metadata.version(name) for name in VERSIONS}
             record = {"versions": versions, "device": device(), "model": model}
             (temporary / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -114,7 +109,10 @@ class Run:
     @cached_property
     def env(self) -> Task:
         """The environment, with the robot that the run was made for, whatever happened to its MJCF since."""
-        return make_env(self.config, _kept_model(self.folder))
+        with _undamaged(self.folder / "run.json"):
+            record = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))
+            version, digests = str(record["versions"]["mujoco"]), dict(record["model"])
+        return make_env(self.config, robot.kept(self.folder, version, digests))
 
     def trainer(self) -> Trainer:
         """The run's training program."""
@@ -123,11 +121,12 @@ class Run:
     def policy(self) -> Policy:
         """The policy of the newest checkpoint. Raises `UserError` if there is none, or it was made with other
         settings."""
-        made = self.trainer()
-        folder = self.folder / "checkpoints"
-        if not folder.is_dir():
+        if not (self.folder / "checkpoints").is_dir():
             raise UserError(f"{self.folder} has no checkpoint yet: resume it")
-        networks = Checkpoints(folder, self._fixed, read_only=True).restore_networks(made.like.networks)
+        checkpoints = self._checkpoints(read_only=True)
+        checkpoints.check()
+        made = self.trainer()
+        networks = checkpoints.restore_networks(made.like.networks)
         return Policy(made.env, made.agent, self.config.ddpg, networks)
 
     def evaluate(
@@ -147,9 +146,9 @@ class Run:
         """The evaluations so far: counters, `targets`, and what `evaluate` returns."""
         return _read_evaluations(self.folder / "evaluations.json")
 
-    @property
-    def _fixed(self) -> dict[str, Any]:
-        return config.fixed(self.config)
+    def _checkpoints(self, read_only: bool = False) -> Checkpoints:
+        fixed, budget = config.fixed(self.config), config.may_change(self.config)
+        return Checkpoints(self.folder / "checkpoints", fixed, budget, read_only)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -193,11 +192,14 @@ def train(settings: Config, folder: str | Path | None = None, reporter: Reporter
     Raises:
         UserError: The configuration cannot be trained, or the folder exists.
 
+    >>> import tempfile
     >>> from arm5dof import load_config, train
+    >>> folder = tempfile.TemporaryDirectory()
     >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 100}
-    >>> run = train(load_config("kinematic.toml", updates_per_step=1, **budget), "runs/short")
-    >>> (run.folder / "report.md").exists()
-    True
+    >>> config = load_config("kinematic.toml", updates_per_step=1, **budget)  # Seconds, and far from enough.
+    >>> run = train(config, f"{folder.name}/short")
+    >>> run.evaluations[-1]["episodes"], run.metrics["env_steps"][-1], (run.folder / "report.md").exists()
+    (2, 320.0, True)
     """
     made = make_trainer(settings)  # What is wrong with the robot or the budget is said before a folder exists.
     run = Run.create(settings, folder or free_folder(settings.task.rpartition(":")[2]), made.env)
@@ -223,13 +225,17 @@ def resume(run: Run, reporter: Reporter | None = None, made: Trainer | None = No
         UserError: Its checkpoint is damaged or was made with other settings, or another process trains it.
     """
     with run.locked():
-        _train(run, made or run.trainer(), reporter or Silent())
+        checkpoints, reporter = run._checkpoints(), reporter or Silent()
+        # What no longer fits is said before a trainer is made of it.
+        if changed := checkpoints.check():
+            told = ", ".join(f"{name} {before} -> {now}" for name, (before, now) in changed.items())
+            reporter.say(f"changed since the last checkpoint: {told}")
+        _train(run, made or run.trainer(), checkpoints, reporter)
     return run
 
 
-def _train(run: Run, made: Trainer, reporter: Reporter) -> None:
+def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter) -> None:
     budget, length = run.config.train, made.env.episode_length
-    checkpoints = Checkpoints(run.folder / "checkpoints", run._fixed)
     reporter.update(0, "compiling")
     if checkpoints.latest is None:
         reporter.say(f"replay buffer: {run.config.ddpg.replay_capacity} transitions, {made.replay_bytes / 1e6:.1f} MB")
@@ -293,47 +299,6 @@ def _note(env: Task, rows: list[dict[str, Any]], metrics: dict[str, float]) -> s
     )
 
 
-def _keep_model(folder: Path, env: Task) -> dict[str, str]:
-    """Write the task's MuJoCo model into a folder: compiled, which only the same MuJoCo reads, and as MJCF with its
-    assets, which newer ones read too, to the six digits that MuJoCo writes. Returns the files' digests."""
-    if env.mj_model is None:
-        return {}
-    buffer = np.empty(mujoco.mj_sizeModel(env.mj_model), np.uint8)
-    mujoco.mj_saveModel(env.mj_model, None, buffer)
-    (folder / "model.mjb.gz").write_bytes(gzip.compress(buffer.tobytes(), 3, mtime=0))
-    if env.mj_spec is not None:
-        env.mj_spec.to_zip(str(folder / "model.zip"))
-    return {path.name: _digest(path) for path in sorted(folder.glob("model.*"))}
-
-
-def _kept_model(folder: Path) -> mujoco.MjModel | None:
-    """The model in a run's folder, or None if it has none. Raises `UserError` if it is damaged or cannot be read."""
-    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    if not record["model"]:
-        return None
-    same = record["versions"]["mujoco"] == metadata.version("mujoco")
-    name = "model.mjb.gz" if same else "model.zip"
-    path = folder / name
-    if name not in record["model"]:
-        raise UserError(
-            f"{folder} keeps its robot as MuJoCo {record['versions']['mujoco']} has it: install that version"
-        )
-    if not path.is_file() or _digest(path) != record["model"][name]:
-        raise UserError(f"{path}, the run's robot, is missing or damaged: take it from a copy of the run")
-    if same:
-        return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": gzip.decompress(path.read_bytes())})
-    warnings.warn(
-        f"{folder} was made with MuJoCo {record['versions']['mujoco']}: its robot is compiled anew from MJCF, whose "
-        "numbers have six digits",
-        stacklevel=2,
-    )
-    return mujoco.MjSpec.from_zip(str(path)).compile()
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 @contextmanager
 def _appending(path: Path, rows: list[dict[str, Any]]) -> Iterator[Any]:
     """Rewrite the rows that the checkpoint knows, then append: what a kill cut off in mid-line is gone."""
@@ -355,15 +320,31 @@ def _appending(path: Path, rows: list[dict[str, Any]]) -> Iterator[Any]:
 
 
 def _read_rows(path: Path) -> list[dict[str, Any]]:
-    """The complete rows."""
+    """The complete rows. Raises `UserError` for what is no number."""
     if not path.exists():
         return []
-    with open(path, newline="") as handle:
-        return [row for row in csv.DictReader(handle) if all(row.values()) and None not in row]
+    with _undamaged(path), open(path, newline="", encoding="utf-8") as handle:
+        rows = [row for row in csv.DictReader(handle) if all(row.values()) and None not in row]
+        for row in rows:
+            _ = int(row["steps"]), [float(value) for value in row.values()]
+        return rows
 
 
 def _read_evaluations(path: Path) -> list[dict[str, Any]]:
-    return json.loads(path.read_text()) if path.exists() else []
+    if not path.exists():
+        return []
+    with _undamaged(path):
+        return [{**e, "steps": int(e["steps"])} for e in json.loads(path.read_text(encoding="utf-8"))]
+
+
+@contextmanager
+def _undamaged(path: Path) -> Iterator[None]:
+    """Raise `UserError` for what goes wrong when a file of a run is read."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, csv.Error) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(f"{path} is damaged ({reason}): take it from a copy of the run") from None
 
 
 def free_folder(name: str) -> Path:

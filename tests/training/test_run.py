@@ -1,0 +1,282 @@
+"""A run's folder is all that it takes: to answer, to be measured and to go on, wherever it lies, whatever became of
+what it was made from, and for no other settings than its own."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import tomli_w
+
+from arm5dof.errors import UserError
+from arm5dof.runtime import files
+from arm5dof.training import config
+from arm5dof.training.checkpoint import Checkpoints
+from arm5dof.training.config import load_config
+from arm5dof.training.run import Run, Silent, resume, train
+
+TINY = {
+    **{"episodes": 4, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 40, "interim_targets": 40},
+    **{"episode_length": 16, "epoch_steps": 8, "refinements": 1, "replay_capacity": 1024, "batch_size": 16},
+    **{"actor_width": 16, "actor_depth": 1, "critic_width": 8, "critic_depth": 1, "heads": 2, "updates_per_step": 2},
+}
+GOALS = [[0.15, 0.05, 0.12], [-0.1, 0.1, 0.2], [0.0, 0.2, 0.1]]
+MESH = "\n".join(["v 0 0 0", "v 0.01 0 0", "v 0 0.01 0", "v 0 0 0.01", "f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"])
+
+
+class Told(Silent):
+    """A reporter that remembers, and interrupts the training once so many episodes are done."""
+
+    def __init__(self, until: float = np.inf) -> None:
+        self.until, self.lines = until, list[str]()
+
+    def update(self, done: int, note: str = "") -> None:
+        if done > self.until:
+            raise KeyboardInterrupt
+
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with somebody's own arm: the shipped one with a longer forearm and a mesh, in three files."""
+    folder = tmp_path_factory.mktemp("place") / "workshop"
+    for made in (folder, folder.parent / "parts"):
+        made.mkdir()
+    arm, scene = (files.shipped_file("mjcf", name).read_text() for name in ("arm5.xml", "reach.xml"))
+    assert 'pos="0.145 0 0.030"' in arm
+    mesh = '<asset><mesh name="badge" file="badge.obj"/></asset><worldbody>'
+    badge = '<geom type="mesh" mesh="badge" mass="0.01"/><site name="ee"'
+    arm = arm.replace('pos="0.145 0 0.030"', 'pos="0.1612345678 0 0.030"').replace('<site name="ee"', badge)
+    arm = arm.replace("<worldbody>", mesh).replace("<compiler ", '<compiler meshdir="../parts" ')
+    (folder / "arm5.xml").write_text(arm)
+    (folder / "reach.xml").write_text(scene)
+    (folder.parent / "parts/badge.obj").write_text(MESH)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(workshop: Path) -> dict[str, Path]:
+    """A finished run, and the same one stopped half-way; then the arm's files are edited or gone, and the folder of
+    runs is elsewhere."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(workshop)
+        settings = load_config("kinematic.toml", arm="./reach.xml", **TINY)
+        train(settings, "runs/finished")
+        with pytest.raises(KeyboardInterrupt):
+            train(settings, "runs/half", Told(until=2))
+        expected = Run.open("runs/finished")
+        np.save("runs/answers.npy", expected.policy().solve(GOALS, corrections=2).q)
+        (workshop / "runs/eval.json").write_text(json.dumps(expected.evaluate(40, seed=1)))
+        assert len(Run.open("runs/half").metrics["steps"]) < len(expected.metrics["steps"])
+    (workshop / "runs").rename(workshop.parent / "moved")
+    (workshop / "arm5.xml").write_text("<mujoco/>")
+    for name in ("reach.xml", "../parts/badge.obj"):
+        (workshop / name).unlink()
+    return {name: workshop.parent / "moved" / name for name in ("finished", "half", "answers.npy", "eval.json")}
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory: one where another arm has the file names of ours."""
+    for name in ("reach.xml", "arm5.xml"):
+        (tmp_path / name).write_text(files.shipped_file("mjcf", "arm7.xml").read_text())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def copy(folder: Path, target: Path) -> Path:
+    return Path(shutil.copytree(folder, target))
+
+
+def said(call) -> str:
+    """The one line of the `UserError` that a call raises."""
+    with pytest.raises(UserError) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def final_state(run: Run) -> dict[str, np.ndarray]:
+    """Every array of the last checkpoint."""
+    kept = Checkpoints(run.folder / "checkpoints", config.fixed(run.config), read_only=True)
+    leaves = jax.tree_util.tree_leaves_with_path(kept.restore(run.trainer().like))
+    raw = lambda x: jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return {jax.tree_util.keystr(path): np.asarray(raw(leaf)) for path, leaf in leaves}
+
+
+def test_a_run_answers_for_its_own_robot_anywhere(runs: dict[str, Path], elsewhere: Path):
+    run = Run.open(runs["finished"])
+    assert run.env.arm.reach > 0.28, "not the shipped arm, nor the one of seven joints"
+    answer = run.policy().solve(GOALS, corrections=2)
+    np.testing.assert_array_equal(answer.q, np.load(runs["answers.npy"]))
+    assert json.loads(json.dumps(run.evaluate(40, seed=1))) == json.loads(runs["eval.json"].read_text())
+    data = mujoco.MjData(run.env.arm.mj_model)
+    for q, outcome in zip(answer.q, answer.outcome, strict=True):
+        data.qpos[run.env.arm.qpos] = q
+        mujoco.mj_kinematics(data.model, data)
+        np.testing.assert_allclose(outcome, data.site("ee").xpos, atol=1e-6)
+
+
+def test_half_a_run_goes_on_to_the_same_end_anywhere(runs: dict[str, Path], elsewhere: Path):
+    told = Told()
+    run = resume(Run.open(copy(runs["half"], elsewhere / "half")), told)
+    assert any("resuming" in line and "episode 2" in line for line in told.lines)
+    assert not any("changed" in line for line in told.lines)
+    whole = Run.open(runs["finished"])
+    found, expected = final_state(run), final_state(whole)
+    assert found.keys() == expected.keys() and len(found) > 20
+    for name, value in expected.items():
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
+    assert run.evaluations == whole.evaluations
+    timeless = lambda run: {name: values for name, values in run.metrics.items() if name != "seconds"}
+    assert timeless(run) == timeless(whole)
+
+
+MAY_CHANGE = {
+    *("train.episodes", "train.evaluate_every", "train.checkpoint_every"),
+    *("evaluate.targets", "evaluate.interim_targets"),
+}
+
+
+def another(value: object, choices: list[str] | None) -> object:
+    """Another valid value of a setting."""
+    match value:
+        case str():
+            return next(choice for choice in choices or ["another"] if choice != value)
+        case bool():
+            return not value
+        case int():
+            return 2 * value or 1
+        case _:
+            return value / 2 or 0.5
+
+
+def edit(folder: Path, **changes: object) -> Run:
+    """Change settings in a run's config.toml, by full name."""
+    path = folder / "config.toml"
+    values = tomllib.loads(path.read_text())
+    for name, value in changes.items():
+        section, _, key = name.partition(".")
+        assert values[section][key] != value
+        values[section][key] = value
+    path.write_text(tomli_w.dumps(values))
+    return Run.open(folder)
+
+
+def test_every_edited_setting_is_refused_by_name_or_may_change(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["half"], elsewhere / "edited")
+    text = (folder / "config.toml").read_text()
+    now = Run.open(folder).config.flat()
+    known = [(f"{f.section}.{f.name}", f) for f in config.fields(now["env.task"])]
+    assert {"env.task", *(name for name, _ in known)} == now.keys() > MAY_CHANGE
+    for name, f in known:
+        value = another(now[name], f.choices)
+        (folder / "config.toml").write_text(text)
+        run = edit(folder, **{name: value})
+        if name in MAY_CHANGE:
+            run._checkpoints(read_only=True).check()
+            continue
+        for call in (run.policy, lambda run=run: resume(run), lambda run=run: run.evaluate(1)):
+            assert f"({name} = {now[name]!r}, now {value!r})" in said(call), name
+
+
+def test_budget_and_intervals_may_change_and_are_named(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["half"], elsewhere / "longer")
+    budget = {"train.episodes": 8, "train.evaluate_every": 4, "train.checkpoint_every": 4}
+    run = edit(folder, **budget, **{"evaluate.targets": 50, "evaluate.interim_targets": 30})
+    assert run.policy().solve(GOALS).q.shape == (3, 5)
+    told = Told()
+    resume(run, told)
+    (line,) = [line for line in told.lines if "changed" in line]
+    assert line == (
+        "changed since the last checkpoint: train.episodes 4 -> 8, train.evaluate_every 2 -> 4, "
+        "train.checkpoint_every 2 -> 4, evaluate.targets 40 -> 50, evaluate.interim_targets 40 -> 30"
+    )
+    assert [(e["episodes"], e["targets"]) for e in run.evaluations] == [(2, 40), (4, 30), (8, 50)]
+    assert run.metrics["steps"][-1] == 64
+    again = Told()
+    resume(Run.open(folder), again)
+    assert not any("changed" in line for line in again.lines), "the checkpoint was made with these"
+
+
+def test_a_run_that_did_all_there_is_left_to_do_ends(runs: dict[str, Path], elsewhere: Path):
+    run = resume(edit(copy(runs["finished"], elsewhere / "shorter"), **{"train.episodes": 2}))
+    assert run.evaluations == Run.open(runs["finished"]).evaluations
+
+
+@pytest.mark.parametrize("harm", ["missing", "garbage", "truncated", "another"])
+def test_a_damaged_robot_is_refused(runs: dict[str, Path], elsewhere: Path, harm: str):
+    folder = copy(runs["finished"], elsewhere / "run")
+    path = folder / "model.mjb.gz"
+    match harm:
+        case "missing":
+            path.unlink()
+        case "garbage":
+            path.write_bytes(b"garbage")
+        case "truncated":
+            path.write_bytes(path.read_bytes()[:-100])
+        case "another":
+            path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes())[:-8] + bytes(8)))
+    for call in (Run.open(folder).policy, lambda: resume(Run.open(folder)), lambda: Run.open(folder).env):
+        assert "model.mjb.gz, the run's robot, is missing or damaged: take it from a copy of the run" in said(call)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "garbage", "[]", "3", "{}", '{"model": {}}', '{"versions": {}, "model": {}}', "\x00\xff"]
+)
+@pytest.mark.parametrize("name", ["run.json", "evaluations.json"])
+def test_damaged_records_are_refused(runs: dict[str, Path], elsewhere: Path, name: str, text: str):
+    folder = copy(runs["finished"], elsewhere / "run")
+    (folder / name).write_bytes(text.encode("latin-1"))
+    calls = {"run.json": lambda: Run.open(folder).policy(), "evaluations.json": lambda: Run.open(folder).evaluations}
+    if name == "evaluations.json" and text in ("[]", "{}"):
+        assert Run.open(folder).evaluations == []
+        return
+    for call in (calls[name], lambda: resume(Run.open(folder))):
+        assert re.search(rf"{name} is damaged \(.+\): take it from a copy of the run", said(call))
+
+
+def test_damaged_metrics_are_refused(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["finished"], elsewhere / "run")
+    text = (folder / "metrics.csv").read_text()
+    (folder / "metrics.csv").write_text(text.replace("\n8,", "\neight,"))
+    for call in (lambda: Run.open(folder).metrics, lambda: resume(Run.open(folder))):
+        assert "metrics.csv is damaged" in said(call)
+
+
+def of_another_version(folder: Path) -> dict:
+    """What a run says that was made with another MuJoCo."""
+    record = json.loads((folder / "run.json").read_text())
+    return {**record, "versions": {**record["versions"], "mujoco": "3.0.0"}}
+
+
+def test_another_mujoco_compiles_the_robot_anew(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["finished"], elsewhere / "run")
+    (folder / "run.json").write_text(json.dumps(of_another_version(folder)))
+    (folder / "model.mjb.gz").write_bytes(b"which another version cannot read")
+    with pytest.warns(UserWarning, match=r"made with MuJoCo 3\.0\.0: its robot is compiled anew"):
+        policy = Run.open(folder).policy()
+    exact = Run.open(runs["finished"]).policy()
+    goals = exact.env.arm.forward(exact.env.arm.sample(jax.random.key(0), (200,)))
+    found, expected = policy.solve(goals, corrections=1), exact.solve(goals, corrections=1)
+    assert policy.env.arm.mj_model.nmesh == 1
+    np.testing.assert_allclose(found.outcome, expected.outcome, atol=1e-4)
+    np.testing.assert_allclose(found.errors["distance"], expected.errors["distance"], atol=1e-4)
+
+
+def test_another_mujoco_needs_the_robots_mjcf(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["finished"], elsewhere / "run")
+    record = of_another_version(folder)
+    del record["model"]["model.zip"]
+    (folder / "run.json").write_text(json.dumps(record))
+    assert "keeps its robot as MuJoCo 3.0.0 has it: install that version" in said(Run.open(folder).policy)
