@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 import pytest
 import tomli_w
+from helpers.errors import said
 
-from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.training import config
 from arm5dof.training.checkpoint import Checkpoints
@@ -96,14 +96,6 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def copy(folder: Path, target: Path) -> Path:
     return Path(shutil.copytree(folder, target))
-
-
-def said(call) -> str:
-    """The one line of the `UserError` that a call raises."""
-    with pytest.raises(UserError) as caught:
-        call()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def final_state(run: Run) -> dict[str, np.ndarray]:

@@ -1,0 +1,164 @@
+"""A policy called from Python: what it takes, what it gives, and what it says of mistakes."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers.errors import said
+
+from arm5dof.arm import Arm
+from arm5dof.ddpg import DDPG, DDPGConfig
+from arm5dof.envs import Reach, State, Task
+from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
+from arm5dof.settings import settings, static
+from arm5dof.training.config import load_config
+from arm5dof.training.policy import Policy
+
+SMALL = load_config("kinematic.toml", actor_width=16, actor_depth=1, critic_width=8, critic_depth=1, heads=3).ddpg
+PLAIN = DDPGConfig(actor_width=16, actor_depth=1, critic_width=8, critic_depth=1)
+
+
+@settings
+class IdleConfig:
+    """A task in which nothing happens."""
+
+    episode_length: int = static(default=3)
+
+
+class Idle(Task):
+    """It has no goals."""
+
+    Config: ClassVar[type] = IdleConfig
+    action_size = 1
+
+    def reset(self, key: jax.Array) -> State:
+        zero = jnp.zeros(())
+        return State(zero, {"state": jnp.zeros(2), "privileged_state": jnp.zeros(2)}, zero, zero, {}, {})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return state
+
+
+def untrained(env: Task) -> Policy:
+    """A policy that has learnt nothing."""
+    agent = DDPG(env, SMALL, num_envs=2, episode_length=env.episode_length, total_steps=1)
+    return Policy(env, agent, SMALL, jax.jit(agent.init)(SMALL, jax.random.key(0)).networks)
+
+
+@pytest.fixture(scope="module")
+def policy(kinematic: Reach) -> Policy:
+    return untrained(kinematic)
+
+
+@pytest.fixture(scope="module")
+def pointing(arm: Arm) -> Policy:
+    return untrained(ReachPose(ReachPoseConfig(dynamics="kinematic"), arm))
+
+
+def test_one_goal_is_answered_as_the_first_of_many(policy: Policy):
+    one, many = policy.solve([0.15, 0.05, 0.12], corrections=2), policy.solve([[0.15, 0.05, 0.12]], corrections=2)
+    assert one.q.shape == (5,) and one.outcome.shape == (3,) and one.errors["distance"].shape == ()
+    assert many.q.shape == (1, 5) and many.outcome.shape == (1, 3) and many.errors["distance"].shape == (1,)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[0]), one, many)
+    by_name = policy.solve(target=np.array([0.15, 0.05, 0.12]), corrections=2)
+    jax.tree.map(np.testing.assert_array_equal, one, by_name)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        *([], [[]], np.zeros((0, 3))),
+        *([0.1, 0.2], [[0.1, 0.2]], [[0.1, 0.2, 0.3], [0.1]], np.zeros((1, 1, 3))),
+        *(0.1, "here", None, [["x", "y", "z"]]),
+    ],
+    ids=repr,
+)
+def test_what_is_no_target_is_told_what_one_is(policy: Policy, target):
+    assert said(lambda: policy.solve(target)).startswith("target takes 3 numbers (x, y, z), or rows of them, not ")
+
+
+def test_solve_says_what_it_takes(policy: Policy):
+    point = [0.1, 0.1, 0.1]
+    assert said(lambda: policy.solve([0.1, float("nan"), 0.1])) == "target 1 is not finite: 0.1 nan 0.1"
+    assert said(lambda: policy.solve([point, [0.1, 0, -np.inf]])) == "target 2 is not finite: 0.1 0.0 -inf"
+    takes = "solve takes target (x, y, z) for this task, each once, not "
+    assert said(lambda: policy.solve(taget=point)) == f"{takes}taget"
+    assert said(lambda: policy.solve(point, approach=point)) == f"{takes}target, approach"
+    assert said(lambda: policy.solve(point, target=point)) == f"{takes}target, target"
+    assert said(lambda: policy.solve()) == f"{takes}nothing"
+    for wrong in (-1, 1.5, "2"):
+        said_of = said(lambda wrong=wrong: policy.solve(point, corrections=wrong))
+        assert said_of == f"corrections = {wrong!r}: it should be a whole number, 0 or more"
+
+
+def test_a_goal_of_several_inputs_takes_as_many_of_each(pointing: Policy):
+    points, axes = [[0.15, 0.05, 0.12], [0.1, -0.1, 0.2]], [[0, 0, -1], [1.0, 0, 0]]
+    answer = pointing.solve(points, approach=axes)
+    assert answer.q.shape == (2, 5) and answer.outcome.directions.shape == (2, 1, 3)
+    assert {name: error.shape for name, error in answer.errors.items()} == {"distance": (2,), "angle": (2,)}
+    one = pointing.solve(points[1], axes[1])
+    assert one.q.shape == (5,) and one.outcome.directions.shape == (1, 3)
+    np.testing.assert_allclose(one.q, answer.q[1], atol=1e-6)
+    assert pointing.solve(points[:1], approach=axes[0]).q.shape == (1, 5)
+    takes = "solve takes target (x, y, z) and approach (ax, ay, az) for this task, each once, not target"
+    assert said(lambda: pointing.solve(points)) == takes
+    assert (
+        said(lambda: pointing.solve(points, approach=axes[:1])) == "solve takes as many of each of target and approach"
+    )
+    assert (
+        said(lambda: pointing.solve(points, approach=axes[0])) == "solve takes as many of each of target and approach"
+    )
+    assert "approach takes 3 numbers (ax, ay, az)" in said(lambda: pointing.solve(points[0], approach=[1, 0, 0, 0]))
+
+
+def test_a_policy_without_a_forward_model_only_acts():
+    env = Idle(IdleConfig())
+    agent = DDPG(env, PLAIN, num_envs=2, episode_length=3, total_steps=1)
+    policy = Policy(env, agent, PLAIN, jax.jit(agent.init)(PLAIN, jax.random.key(0)).networks)
+    assert policy(env.reset(jax.random.key(0)).obs).shape == (1,)
+    assert said(lambda: policy.solve([0.1, 0.1, 0.1])) == "the task Idle has no forward model: its policy only acts"
+    assert "solve" not in repr(policy)
+
+
+def test_a_policy_takes_one_observation_or_many(policy: Policy):
+    obs = jax.jit(jax.vmap(policy.env.reset))(jax.random.split(jax.random.key(1), 7)).obs
+    one = jax.tree.map(lambda x: x[3], obs)
+    act, branch = jax.jit(policy), jax.jit(policy.branch)
+    actions, branches = act(obs), branch(obs)
+    assert actions.shape == (7, 5) and branches.shape == (7,)
+    assert policy(one).shape == act(one).shape == (5,) and branch(one).shape == ()
+    np.testing.assert_allclose(policy(one), actions[3], atol=1e-6)
+    np.testing.assert_allclose(act(one), actions[3], atol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.vmap(policy))(obs), actions, atol=1e-6)
+    other = (branches + 1) % 3
+    np.testing.assert_allclose(act(one, other[3]), act(obs, other)[3], atol=1e-6)
+    assert np.abs(act(one, other[3]) - actions[3]).max() > 1e-3
+    np.testing.assert_array_equal(act(jax.tree.map(np.asarray, obs)), actions)
+
+
+def test_a_policy_says_what_it_acts_on(policy: Policy):
+    state, privileged = jnp.zeros((4, 3)), jnp.zeros((4, 11))
+    takes = "a policy acts on observations, a dictionary of privileged_state (11,) and state (3,), not "
+    assert said(lambda: policy([0.1, 0.1, 0.1])) == f"{takes}list; for goals use solve"
+    assert said(lambda: policy({"state": state})) == f"{takes}state; for goals use solve"
+    assert said(lambda: policy({})).startswith(takes)
+    for wrong in (
+        {"state": state[:, :2], "privileged_state": privileged},
+        {"state": state, "privileged_state": privileged[:, :10]},
+        {"state": state[0], "privileged_state": privileged},
+        {"state": state[:2], "privileged_state": privileged},
+        {"state": state[None], "privileged_state": privileged[None]},
+        {"state": 3.0, "privileged_state": privileged},
+    ):
+        for call in (policy, policy.branch, jax.jit(policy)):
+            text = said(lambda call=call, wrong=wrong: call(wrong))
+            assert text.startswith("this policy acts on privileged_state (11,) and state (3,), or (n, size) for n ")
+            assert f"state {np.shape(wrong['state'])}" in text
+
+
+def test_a_policy_shows_itself_as_a_table(policy: Policy):
+    text, html = repr(policy), policy._repr_html_()
+    for word in ("Policy", "Reach", "3 heads", "target (x, y, z)"):
+        assert word in text and word in html
