@@ -69,7 +69,8 @@ def settings(cls: type[T]) -> type[T]:
 
 def _validate(config: Any) -> None:
     """Check a new instance's values, and convert them to the types of their fields."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    given = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    values = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}  # TOML has no tuples.
     fixed = {f.name for f in dataclasses.fields(config) if f.metadata.get("static")}
     plain = {name: v for name, v in values.items() if name in fixed or isinstance(v, (bool, int, float, str))}
     try:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import hashlib
+import json
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -46,8 +47,8 @@ class Checkpoints:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
         self.folder = folder
-        self._settings = dict(settings)
-        self._budget = dict(budget or {})
+        # As a record gives them back: JSON has no tuples.
+        self._settings, self._budget = json.loads(json.dumps([dict(settings), dict(budget or {})]))
         logging.getLogger("absl").setLevel(logging.CRITICAL)
         options = ocp.CheckpointManagerOptions(
             max_to_keep=KEEP,
