@@ -13,6 +13,7 @@ lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo --no-cache
 
 .venv/installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -20,6 +21,6 @@ lint: .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
 
-# Maintainers: resolve anew. One jax for every Python: the newest that the XLA flag in arm5dof/xla.py is known for.
+# Maintainers: resolve anew. One jax for every Python: the newest that the XLA flag in arm5dof/runtime/xla.py is known for.
 lock:
 	echo "jax<0.11" | uv pip compile --universal --quiet --python-version 3.11 --extra test --constraint - pyproject.toml --output-file requirements.lock

@@ -25,10 +25,11 @@ def measure(envs: int, length: int) -> dict[str, float | str]:
     """Control steps per second with learning on and off, and seconds after compilation to each of the goals."""
     import jax
 
-    from arm5dof.training import config, evaluate, run
+    from arm5dof import load_config
+    from arm5dof.training import evaluate, run
 
-    size = {name: str(envs) for name in ("num_envs", "episodes", "evaluate_every", "checkpoint_every")}
-    settings = config.load("gpu.toml", {**size, "episode_length": str(length)})
+    size = dict.fromkeys(("num_envs", "episodes", "evaluate_every", "checkpoint_every"), envs)
+    settings = load_config("gpu.toml", **size, episode_length=length)
     trainer = run.make_trainer(settings)
     ddpg, steps = settings.ddpg, settings.train.epoch_steps
     collect = lambda t: jax.lax.scan(lambda t, _: (trainer.agent.collect(ddpg, t)[0], None), t, None, steps)[0]
@@ -47,7 +48,7 @@ def measure(envs: int, length: int) -> dict[str, float | str]:
         seconds += time.perf_counter() - start
         missing = [name for name in GOALS if name not in found]
         if missing:
-            within = evaluate.evaluate(trainer.policy(), 10_000)[0]["one_shot"]["within"]
+            within = evaluate.evaluate(trainer.policy(), 10_000)["one_shot"]["within"]
             found |= {name: seconds for name in missing if within[GOALS[name][0]] >= GOALS[name][1]}
     found |= {name: "not reached" for name in GOALS if name not in found}
     found["control steps/s, learning"] = trainer.counters.env_steps / seconds

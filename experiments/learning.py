@@ -18,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from arm5dof import Run, load_config
 from arm5dof.runtime import files, xla
-from arm5dof.training import config, run
+from arm5dof.training.run import resume
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -100,12 +101,12 @@ def train(name: str, line: str, seed: int) -> dict:
     experiment, *options = line.split()
     overrides = {option[2:]: value for option, value in zip(options[::2], options[1::2], strict=True)}
     episodes = overrides.get("episodes", "400")
-    settings = config.load(experiment, {**overrides, "seed": str(seed), "evaluate-every": episodes})
+    settings = load_config(experiment, **{**overrides, "seed": seed, "evaluate-every": episodes})
     folder = Path("runs") / "learning" / re.sub(r"\W+", "-", f"{name}-{seed}")
-    opened = run.Run.open(folder) if folder.exists() else run.Run.create(settings, folder)
+    opened = Run.open(folder) if folder.exists() else Run.create(settings, folder)
     if opened.config != settings:
         raise SystemExit(f"{folder} is of another version of this experiment: move it away")
-    return run.train(opened)[-1]
+    return resume(opened).evaluations[-1]
 
 
 def markdown(title: str, found: dict[str, list[dict]], seeds: int) -> str:

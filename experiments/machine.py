@@ -95,15 +95,17 @@ def update() -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
-    from arm5dof.ddpg import DDPG, DDPGConfig
+    from arm5dof import load_config
+    from arm5dof.ddpg import DDPG
     from arm5dof.runtime import xla
 
-    config, count = DDPGConfig(), 512
+    config, count = load_config("reach.toml").ddpg, 512
     agent = DDPG(reach("kinematic"), config, num_envs=64, episode_length=160, total_steps=1000)
     training = jax.jit(agent.init)(config, jax.random.key(0))
     training = jax.jit(lambda t: agent.collect(config, t)[0])(training)
-    batches = training.replay.sample(jax.random.key(1), (count, config.batch_size))
-    batches = (batches, agent.views(config, batches))
+    replay = training.replay
+    batches = replay.read(replay.sample(jax.random.key(1), (count, config.batch_size)))
+    batches = (batches, agent.critic_inputs(config, batches))
     scan = lambda t, b: jax.lax.scan(lambda t, b: agent.update(config, t, *b), t, b)[0].networks
     learn = jax.jit(scan, compiler_options=xla.effort(2))
 
@@ -154,10 +156,11 @@ def profile() -> dict[str, float]:
     """What a training step of the default experiment consists of: 50 environments, 128 updates."""
     import jax
 
+    from arm5dof import load_config
     from arm5dof.runtime import xla
-    from arm5dof.training import config, run
+    from arm5dof.training import run
 
-    trainer = run.make_trainer(config.load("reach.toml"))
+    trainer = run.make_trainer(load_config("reach.toml"))
     agent, ddpg = trainer.agent, trainer.config.ddpg
     jit = partial(jax.jit, compiler_options=xla.effort(2))
     trainer.start()
@@ -169,7 +172,7 @@ def profile() -> dict[str, float]:
 
     def draw(t):
         batches = agent.relabel(ddpg, t.replay, t.replay.sample(key, shape), key)
-        return batches, agent.views(ddpg, batches)
+        return batches, agent.critic_inputs(ddpg, batches)
 
     draw = jit(draw)
     batches = draw(state)
@@ -191,17 +194,19 @@ def replay() -> dict[str, float]:
     """An insert of 64 and a sample of 64 x 64 transitions, at capacities up to ten million."""
     import jax
 
-    from arm5dof.ddpg import DDPG, DDPGConfig, Replay, Transition
+    from arm5dof import load_config
+    from arm5dof.ddpg import DDPG, Replay, Transition
 
-    agent = DDPG(reach("kinematic"), DDPGConfig(), num_envs=64, episode_length=160, total_steps=1000)
-    one = jax.jit(lambda key: agent.init(DDPGConfig(), key).replay.sample(key, ()))(jax.random.key(0))
+    config = load_config("reach.toml").ddpg
+    agent = DDPG(reach("kinematic"), config, num_envs=64, episode_length=160, total_steps=1000)
+    one = jax.jit(lambda key: jax.tree.map(lambda x: x[0], agent.init(config, key).replay.storage))(jax.random.key(0))
     batch: Transition = jax.tree.map(lambda x: jax.numpy.ones((64, *x.shape), x.dtype), one)
     insert = jax.jit(lambda r: r.insert(batch), donate_argnums=0)
-    sample = jax.jit(lambda r, key: jax.tree.map(jax.numpy.sum, r.sample(key, (64, 64))))
+    sample = jax.jit(lambda r, key: jax.tree.map(jax.numpy.sum, r.read(r.sample(key, (64, 64)))))
     keys = jax.random.split(jax.random.key(0), 200)
     found = {}
     for capacity in (10_048, 100_032, 1_000_000, 10_000_000):
-        create = partial(Replay.create, capacity=capacity)
+        create = partial(Replay.create, capacity=capacity, batch=64)
         buffer = insert(jax.jit(create)(one))
         buffer = buffer.replace(size=jax.numpy.int32(capacity))
         start = time.perf_counter()
@@ -216,11 +221,12 @@ def replay() -> dict[str, float]:
 
 def first_step() -> dict[str, float]:
     """Compile the default experiment's program and take one step of every environment, gradient steps included."""
+    from arm5dof import load_config
     from arm5dof.runtime import xla
-    from arm5dof.training import config, run
+    from arm5dof.training import run
 
     xla.enable_compilation_cache()
-    trainer = run.make_trainer(config.load("reach.toml", {"epoch_steps": "1"}))
+    trainer = run.make_trainer(load_config("reach.toml", epoch_steps=1))
     trainer.start()
     trainer.advance()
     return {}

@@ -14,9 +14,11 @@ import platform
 from pathlib import Path
 
 import numpy as np
+from figures import PAPER_TABLE_2
 
+from arm5dof import Run, load_config, make_env
 from arm5dof.runtime import files, xla
-from arm5dof.training import config, report, run
+from arm5dof.training.run import resume
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -29,7 +31,7 @@ def main() -> None:
     xla.enable_compilation_cache()
     for name in arguments.experiments:
         evaluations = [train(name, seed) for seed in range(arguments.seeds)]
-        headline = report.headline(config.load(f"{name}.toml"))
+        headline = make_env(load_config(f"{name}.toml")).headline
         RESULTS.mkdir(exist_ok=True)
         files.write_text(RESULTS / f"table2_{name}.json", json.dumps(evaluations, indent=1) + "\n")
         files.write_text(RESULTS / f"table2_{name}.md", markdown(name, headline, evaluations))
@@ -38,8 +40,8 @@ def main() -> None:
 def train(name: str, seed: int) -> list[dict]:
     """The evaluations of one run, trained now or before."""
     folder = Path("runs") / "table2" / f"{name}-{seed}"
-    settings = config.load(f"{name}.toml", {"seed": str(seed), "interim_targets": "10000"})
-    return run.train(run.Run.open(folder) if folder.exists() else run.Run.create(settings, folder))
+    settings = load_config(f"{name}.toml", seed=seed, interim_targets=10_000)
+    return resume(Run.open(folder) if folder.exists() else Run.create(settings, folder)).evaluations
 
 
 def markdown(name: str, headline: str, evaluations: list[list[dict]]) -> str:
@@ -58,7 +60,7 @@ def markdown(name: str, headline: str, evaluations: list[list[dict]]) -> str:
     ]
     for row, reduce in (("Min", np.min), ("Max", np.max), ("Mean", np.mean)):
         ours = " | ".join(f"**{value:.2f} %**" for value in reduce(within, axis=0))
-        paper = " | ".join(f"{report.PAPER_TABLE_2[row][e]:g} %" for e in episodes)
+        paper = " | ".join(f"{PAPER_TABLE_2[row][e]:g} %" for e in episodes)
         lines += [f"| {row}, ours | {ours} |", f"| {row}, paper | {paper} |"]
     lines += [
         "",

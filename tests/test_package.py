@@ -46,6 +46,7 @@ def test_models_and_experiments_are_found_from_an_installed_wheel(wheel, tmp_pat
 def test_wheel_carries_all_experiments_and_neither_results_nor_test_data(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert not [name for name in names if name.endswith((".pt", ".onnx", ".jpg"))]
+    assert "arm5dof/py.typed" in names
     experiments = {path.name for path in (ROOT / "experiments").glob("*.toml")}
     assert {Path(name).name for name in names if "/experiments/" in name} == experiments
     (weights,) = [info for info in zipfile.ZipFile(wheel).infolist() if info.filename.endswith(".npz")]

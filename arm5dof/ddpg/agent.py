@@ -69,8 +69,9 @@ class DDPGConfig:
     critic_input: Literal["outcome", "state"] = static(default="state")
     """state: the critic sees the observation and the action; outcome: it sees where the action leads by the task's
     forward model, as the paper's does."""
-    critic_form: Literal["distance", "scalar"] = static(default="scalar")
-    """scalar: Q is any number; distance: Q is minus a learnt distance, for rewards that are minus a distance."""
+    critic_form: Literal["scalar", "distance", "linear_distance"] = static(default="scalar")
+    """scalar: Q is any number; distance: Q is minus a learnt distance, for rewards that are minus a distance;
+    linear_distance: to what that learns, a linear function of the critic's input is added."""
     batch_size: Count = static(default=64)
     """Transitions in an update."""
     updates_per_step: Count = static(default=128)
@@ -127,7 +128,7 @@ class DDPG:
         self.forward_model: ForwardModel | None = env if isinstance(env, ForwardModel) else None
         if config.critic_input == "outcome" and self.forward_model is None:
             raise UserError('this environment foresees no outcome of an action: choose critic_input = "state"')
-        if config.critic_form == "distance" and self.goal_env is None:
+        if config.critic_form != "scalar" and self.goal_env is None:
             raise UserError('this environment\'s rewards may be no distances: choose critic_form = "scalar"')
         self.vector = VectorEnv(env, episode_length)
         self.episode_length = episode_length

@@ -62,10 +62,12 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """Q(s, a): the critic's view of an observation and an action, (..., view), to values (...).
+    """Q(s, a): what the critic sees of an observation and an action, (..., size), to values (...).
 
-    In the form "distance" Q = -|MLP(view)|, the length of a learnt vector: where rewards are minus a distance (Eq. 7),
-    values have a tip at the goal that a smooth network rounds off. "scalar" is a plain network with one output.
+    In the form "distance" Q = -|MLP(x)|, the length of a learnt vector: where rewards are minus a distance (Eq. 7),
+    values have a tip at the goal that a smooth network rounds off. In "linear_distance" Q = -|A x + MLP(x)|: where the
+    critic sees the difference from the goal, A x can be the distance itself. "scalar" is a plain network with one
+    output.
     """
 
     form: str
@@ -75,9 +77,11 @@ class Critic(nn.Module):
     layer_norm: bool
 
     @nn.compact
-    def __call__(self, view: jax.Array) -> jax.Array:
-        size = EMBEDDING if self.form == "distance" else 1
-        out = MLP(self.width, self.depth, size, self.activation, self.layer_norm)(view)
+    def __call__(self, x: jax.Array) -> jax.Array:
+        size = 1 if self.form == "scalar" else EMBEDDING
+        out = MLP(self.width, self.depth, size, self.activation, self.layer_norm)(x)
         if self.form == "scalar":
             return out[..., 0]
+        if self.form == "linear_distance":
+            out = out + nn.Dense(size, use_bias=False)(x)
         return -jnp.sqrt((out**2).sum(-1) + 1e-12)

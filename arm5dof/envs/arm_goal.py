@@ -255,7 +255,7 @@ class ArmGoalEnv(Task):
         return {
             kind if i == 0 else f"{kind}_{component}": errors[component]
             for kind, errors in kinds.items()
-            for i, component in enumerate(errors)
+            for i, component in enumerate(self.components)
         }
 
     def watch(self, act: Act, key: jax.Array) -> dict[str, jax.Array]:

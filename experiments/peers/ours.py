@@ -12,8 +12,9 @@ from pathlib import Path
 
 from task import Record
 
+from arm5dof import load_config
 from arm5dof.runtime import xla
-from arm5dof.training import config, run
+from arm5dof.training import run
 
 
 def main() -> None:
@@ -28,7 +29,7 @@ def main() -> None:
     budget = {name: str(getattr(arguments, name)) for name in ("seed", "episodes", "num_envs")}
     every = {"evaluate_every": budget["num_envs"], "checkpoint_every": budget["num_envs"]}
     overrides = dict(pair.split("=", 1) for pair in arguments.set)
-    trainer = run.make_trainer(config.load("kinematic.toml", {**budget, **every, **overrides}))
+    trainer = run.make_trainer(load_config("kinematic.toml", **budget, **every, **overrides))
 
     record = Record(arguments.out, minutes=60, transitions=trainer.total_steps * arguments.num_envs)
     trainer.start()
@@ -36,7 +37,7 @@ def main() -> None:
     while not over:
         trainer.advance()
         policy = trainer.policy()
-        answer = lambda goals, policy=policy: policy.arm.to_action(policy(goals).q)
+        answer = lambda goals, policy=policy: policy.env.arm.to_action(policy.solve(goals).q)
         over = record.measure(trainer.counters.env_steps, answer)
     record.finish()
 

@@ -8,6 +8,9 @@ import jax.numpy as jnp
 from arm5dof.envs import State
 from arm5dof.envs.base import Observation
 
+Next = tuple[jax.Array, jax.Array | float, jax.Array | float]
+"""The next observation, the reward, and whether the episode has ended for good."""
+
 
 class Toy:
     """One action. What the actor sees, the critic sees too."""
@@ -18,8 +21,8 @@ class Toy:
         """The first observation, a vector."""
         raise NotImplementedError
 
-    def next(self, seen: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array | float, jax.Array | float]:
-        """The next observation, the reward, and whether the episode has ended for good."""
+    def next(self, seen: jax.Array, action: jax.Array) -> Next:
+        """What follows an action."""
         raise NotImplementedError
 
     def reset(self, key: jax.Array) -> State:
@@ -43,7 +46,7 @@ class Bandit(Toy):
     def first(self, key: jax.Array) -> jax.Array:
         return jax.random.uniform(key, (1,), minval=-0.8, maxval=0.8)
 
-    def next(self, seen: jax.Array, action: jax.Array):
+    def next(self, seen: jax.Array, action: jax.Array) -> Next:
         return seen, -((action - seen[0]) ** 2), 1.0
 
 
@@ -56,7 +59,7 @@ class Loan(Toy):
     def first(self, key: jax.Array) -> jax.Array:
         return jnp.zeros(2)
 
-    def next(self, seen: jax.Array, action: jax.Array):
+    def next(self, seen: jax.Array, action: jax.Array) -> Next:
         late, borrowed = seen
         borrowed = jnp.where(late > 0, borrowed, action)
         return jnp.stack([jnp.ones(()), borrowed]), jnp.where(late > 0, 2 * borrowed, -(action**2)), late
@@ -76,7 +79,7 @@ class Salary(Toy):
     def first(self, key: jax.Array) -> jax.Array:
         return jnp.zeros(1)
 
-    def next(self, seen: jax.Array, action: jax.Array):
+    def next(self, seen: jax.Array, action: jax.Array) -> Next:
         if self.years is None:
             return seen, 1.0, 0.0
         served = seen + 1 / self.years
@@ -93,7 +96,7 @@ class Walk(Toy):
     def first(self, key: jax.Array) -> jax.Array:
         return jax.random.uniform(key, (1,))
 
-    def next(self, seen: jax.Array, action: jax.Array):
+    def next(self, seen: jax.Array, action: jax.Array) -> Next:
         position = seen + 1
         fallen = jnp.where(position > self.cliff, self.poison, position)
         return fallen, fallen[0], position[0] > self.end

@@ -1,6 +1,10 @@
 """Photographs of boards, drawn through a camera that is known."""
 
+from __future__ import annotations
+
 import functools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,15 +31,15 @@ OVERSAMPLING = 2
 
 
 @functools.cache
-def rays():
+def rays() -> np.ndarray:
     """Where the true camera's pixels, and those between them, look on the plane at depth 1, (h, w, 2)."""
     u, v = (np.arange(OVERSAMPLING * n) for n in (TRUE.width, TRUE.height))
     pixels = (np.stack(np.meshgrid(u, v), -1) + 0.5) / OVERSAMPLING - 0.5
-    plane = cv2.undistortPoints(pixels.reshape(-1, 1, 2), TRUE.matrix, TRUE.distortion)
+    plane = cv2.undistortPoints(pixels.reshape(-1, 1, 2), *TRUE.opencv)
     return plane.reshape(pixels.shape)
 
 
-def photograph(drawing, metres_per_pixel, origin, pose):
+def photograph(drawing: np.ndarray, metres_per_pixel: float, origin: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """What the true camera sees of a drawing whose pixel `origin` is the board's origin, at the board's pose (4, 4)
     in the camera's frame."""
     homography = np.linalg.inv(np.c_[pose[:3, :2], pose[:3, 3]])
@@ -45,7 +49,7 @@ def photograph(drawing, metres_per_pixel, origin, pose):
     return cv2.resize(image, (TRUE.width, TRUE.height), interpolation=cv2.INTER_AREA)
 
 
-def poses(rng, n, center, distance=0.5):
+def poses(rng: np.random.Generator, n: int, center: tuple[float, float], distance: float = 0.5) -> Iterator[np.ndarray]:
     """Board poses (4, 4) in front of the camera, tilted by up to 40 degrees."""
     for _ in range(n):
         turn, _ = cv2.Rodrigues(np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1)]))
@@ -56,20 +60,18 @@ def poses(rng, n, center, distance=0.5):
         yield pose
 
 
-def draw(board):
+def draw(board: Checkerboard | Charuco) -> tuple[np.ndarray, float, np.ndarray]:
     """A drawing, its metres per pixel, and the pixel of the board's origin."""
     scale = 24
     if isinstance(board, Charuco):
         image = board.opencv.generateImage((scale * board.columns, scale * board.rows), marginSize=0)
         return image, board.square / scale, np.array([scale - 0.5, scale - 0.5])
     squares = np.indices((board.rows + 1, board.columns + 1)).sum(0) % 2 * 255
-    image = cv2.copyMakeBorder(
-        np.kron(squares, np.ones((scale, scale))).astype(np.uint8), *[scale] * 4, cv2.BORDER_CONSTANT, value=255
-    )
+    image = np.pad(np.kron(squares, np.ones((scale, scale))).astype(np.uint8), scale, constant_values=255)
     return image, board.square / scale, np.array([2 * scale - 0.5, 2 * scale - 0.5])
 
 
-def matrix(rotation, position):
+def matrix(rotation: Rotation, position: Sequence[float]) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
     return pose
@@ -82,7 +84,7 @@ OTHER = matrix(Rotation.from_euler("xyz", [0.2, 0.1, -0.5]), [0.3, 0.1, 0.02])
 """The board's pose, where it lies or in the hand."""
 
 
-def photograph_board(folder):
+def photograph_board(folder: Path) -> tuple[list[Path], np.ndarray]:
     """Photographs of a board in a folder, and its poses (4, 4) in the camera's frame; the last shows none."""
     rng = np.random.default_rng(3)
     seen = list(poses(rng, 10, (0.1, 0.06)))
@@ -93,12 +95,12 @@ def photograph_board(folder):
     return paths, np.array([*seen, seen[0]])
 
 
-def hand_poses(seen, eye_in_hand):
+def hand_poses(seen: np.ndarray, eye_in_hand: bool) -> np.ndarray:
     """The hand's poses (n, 4, 4) at which the camera sees the board so."""
     return OTHER @ np.linalg.inv(CAMERA @ seen) if eye_in_hand else CAMERA @ seen @ np.linalg.inv(OTHER)
 
 
-def write_poses(path, arm, names):
+def write_poses(path: Path, arm: np.ndarray, names: Sequence[str]) -> Path:
     """A CSV file of the hand's poses (n, 4, 4) and photographs."""
     turns = np.roll(Rotation.from_matrix(arm[:, :3, :3]).as_quat(), 1, axis=1)
     rows = [",".join(map(str, [n, *a[:3, 3], *q])) for n, a, q in zip(names, arm, turns, strict=True)]

@@ -1,10 +1,15 @@
 """Cameras over a table, calibrated and posed with noise as real ones are, and MuJoCo's word for what they see; objects
 on the table, their detections and their boxes."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import cv2
 import jax
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from arm5dof.vision.calibration.boards import Checkerboard, Corners
@@ -25,13 +30,13 @@ BOARD_TO_BASE[:3, :3] = np.diag([1, -1, -1])
 BOARD_TO_BASE[:3, 3] = 0.05, 0.06, 0
 
 
-def pose(rotation, position):
+def pose(rotation: np.ndarray, position: np.ndarray | Sequence[float]) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, position
     return matrix
 
 
-def over_the_table(rng, low=35, high=85):
+def over_the_table(rng: np.random.Generator, low: float = 35, high: float = 85) -> np.ndarray:
     """A camera's pose (4, 4), 0.6 to 0.9 m from the center of the table, so many degrees above it, a little rolled."""
     height, around = np.deg2rad(rng.uniform(low, high)), rng.uniform(0, 2 * np.pi)
     away = np.array([np.cos(height) * np.cos(around), np.cos(height) * np.sin(around), np.sin(height)])
@@ -42,30 +47,30 @@ def over_the_table(rng, low=35, high=85):
     return pose(level @ roll, [0.15, 0, 0] + rng.uniform(0.6, 0.9) * away)
 
 
-def camera_at(matrix, lens=LENS):
+def camera_at(matrix: np.ndarray, lens: tuple[np.ndarray, np.ndarray] = LENS) -> Camera:
     return Camera(*lens, matrix[:3, :3], matrix[:3, 3], WIDTH, HEIGHT)
 
 
-def corners(rng, board, noise=0.2):
+def corners(rng: np.random.Generator, board: np.ndarray, noise: float = 0.2) -> Corners:
     """The board's corners as the true lens shows them, off by `noise` pixels."""
     pixels, _ = cv2.projectPoints(BOARD.points, cv2.Rodrigues(board[:3, :3])[0], board[:3, 3], *LENS)
     return Corners(BOARD.points, (pixels[:, 0] + noise * rng.normal(size=(54, 2))).astype(np.float32))
 
 
-def calibrated(rng):
+def calibrated(rng: np.random.Generator) -> Camera:
     """A camera with LENS, calibrated from 13 views of a board."""
-    views = []
+    views: list[BoardView] = []
     while len(views) < 13:
         turn = Rotation.from_rotvec(np.deg2rad(rng.uniform(-35, 35, 3))).as_matrix()
         board = pose(turn, [*rng.uniform(-0.08, 0.08, 2), rng.uniform(0.35, 0.6)]) @ pose(np.eye(3), [-0.1, -0.0625, 0])
         seen = corners(rng, board)
         if (seen.pixels > 5).all() and (seen.pixels < [WIDTH - 6, HEIGHT - 6]).all():
             views.append(BoardView(str(len(views)), seen))
-    camera, seen = fit(views, (WIDTH, HEIGHT)).camera, [view.corners for view in views]
-    return add_intrinsics_covariance(camera, seen, [board_pose(camera, c) for c in seen])
+    camera, found = fit(views, (WIDTH, HEIGHT)).camera, [view.corners for view in views]
+    return add_intrinsics_covariance(camera, found, [board_pose(camera, c) for c in found])
 
 
-def calibrated_and_posed(rng):
+def calibrated_and_posed(rng: np.random.Generator) -> tuple[Camera, Camera]:
     """A camera over the table, and what one knows of it: calibrated from 13 views, posed from a board on the table."""
     true, camera = over_the_table(rng), calibrated(rng)
     seen = corners(rng, np.linalg.inv(true) @ BOARD_TO_BASE)
@@ -92,11 +97,13 @@ OBJECTS = {
 SOLIDS = {name: solid for name, (_, solid) in OBJECTS.items()}
 
 
-def numbers(array):
+def numbers(array: ArrayLike) -> str:
     return " ".join(f"{v:.9g}" for v in np.ravel(array))
 
 
-def table(rng, names, camera_poses):
+def table(
+    rng: np.random.Generator, names: Sequence[str], camera_poses: Sequence[np.ndarray]
+) -> tuple[mujoco.MjModel, mujoco.MjData, np.ndarray]:
     """Objects standing on a table, turned at random, and cameras: MuJoCo's model and data, and the centers (n, 3)."""
     places: list[np.ndarray] = []
     while len(places) < len(names):
@@ -122,7 +129,7 @@ def table(rng, names, camera_poses):
     return model, data, centers
 
 
-def cast(model, data, camera):
+def cast(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """What MuJoCo's rays hit in each pixel: geom ids (h, w) and depths (h, w)."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     plane = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(camera.matrix).T
@@ -136,7 +143,7 @@ def cast(model, data, camera):
     return ids.reshape(shape), np.where(ids < 0, np.inf, distance / length).reshape(shape)
 
 
-def boxes(model, ids, count):
+def boxes(model: mujoco.MjModel, ids: np.ndarray, count: int) -> np.ndarray:
     """The boxes (n, 4) around the objects in a segmentation (h, w)."""
     found = []
     for i in range(count):
@@ -148,16 +155,22 @@ def boxes(model, ids, count):
 NAMES = tuple(SOLIDS)
 
 
-def detections(boxes, names):
+def detections(boxes: np.ndarray, names: Sequence[str]) -> Detections:
     """In the order given: the first is the most confident."""
-    ids = [NAMES.index(name) for name in names]
+    ids = np.array([NAMES.index(name) for name in names], int)
     return Detections(boxes, np.linspace(0.9, 0.5, len(ids)), ids, NAMES)
 
 
 many_boxes = jax.jit(jax.vmap(solid_box, (None, 0, 0, 0, 0)))
 
 
-def ideal_boxes(camera, centers, radii, names, half_heights=None):
+def ideal_boxes(
+    camera: Camera,
+    centers: np.ndarray,
+    radii: np.ndarray,
+    names: Sequence[str],
+    half_heights: Sequence[float] | np.ndarray | None = None,
+) -> np.ndarray:
     """The boxes (n, 4) of solids of known width."""
     if half_heights is None:
         half_heights = [SOLIDS[name].half_height for name in names]
@@ -165,12 +178,12 @@ def ideal_boxes(camera, centers, radii, names, half_heights=None):
     return np.asarray(many_boxes(camera, centers, radii, np.array(half_heights), forms))
 
 
-def on_the_table(rng, names):
+def on_the_table(rng: np.random.Generator, names: Sequence[str]) -> np.ndarray:
     places = np.c_[rng.uniform(0.05, 0.28, len(names)), rng.uniform(-0.12, 0.12, len(names))]
     return np.c_[places, [SOLIDS[name].half_height for name in names]]
 
 
-def random_lens(rng, coefficients):
+def random_lens(rng: np.random.Generator, coefficients: int) -> tuple[np.ndarray, np.ndarray]:
     """Distortion such as lenses have: the corners of the image move by up to some 60 pixels."""
     scale = np.array([0.25, 0.08, 2e-3, 2e-3, 0.03, 0.1, 0.03, 0.01])[:coefficients]
     focal = rng.uniform(450, 700)
