@@ -41,7 +41,7 @@ def seconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
 
 def reach(dynamics: str = "servo"):
     from arm5dof.arm import load_arm
-    from arm5dof.envs import Reach, ReachConfig
+    from arm5dof.envs.reach import Reach, ReachConfig
 
     return Reach(ReachConfig(dynamics=dynamics), load_arm("reach.xml"))
 

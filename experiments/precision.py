@@ -14,7 +14,7 @@ import numpy as np
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.kinematics import forward, inverse
-from arm5dof.envs import Reach, ReachConfig
+from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.runtime import files
 
 POSES, ENVS, STEPS = 1_000_000, 256, 160

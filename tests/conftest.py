@@ -16,7 +16,7 @@ xla.enable_compilation_cache()
 
 if TYPE_CHECKING:
     from arm5dof.arm import Arm
-    from arm5dof.envs import Reach
+    from arm5dof.envs.reach import Reach
 
 settings.register_profile("arm5dof", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("arm5dof")
@@ -49,7 +49,7 @@ def arm() -> Arm:
 @pytest.fixture(scope="session")
 def kinematic(arm: Arm) -> Reach:
     """Reach where an action is the pose."""
-    from arm5dof.envs import Reach, ReachConfig
+    from arm5dof.envs.reach import Reach, ReachConfig
 
     return Reach(ReachConfig(dynamics="kinematic"), arm)
 
@@ -57,6 +57,6 @@ def kinematic(arm: Arm) -> Reach:
 @pytest.fixture(scope="session")
 def servo(arm: Arm) -> Reach:
     """Reach in MJX physics, with the observation that holds velocities too."""
-    from arm5dof.envs import Reach, ReachConfig
+    from arm5dof.envs.reach import Reach, ReachConfig
 
     return Reach(ReachConfig(dynamics="servo", observation="full"), arm)

@@ -15,7 +15,7 @@ from helpers.errors import said
 import arm5dof
 from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPGConfig
-from arm5dof.envs import ReachConfig
+from arm5dof.envs.reach import ReachConfig
 from arm5dof.errors import UserError
 from arm5dof.training.config import load_config
 from arm5dof.training.run import Run

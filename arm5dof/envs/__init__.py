@@ -1,7 +1,6 @@
 """Environments: pure, single, batched with `jax.vmap`. A task is one file here, or a class of the user's own."""
 
 from arm5dof.envs.base import Env, ForwardModel, GoalEnv, State, Task
-from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.envs.vector import VectorEnv
 
-__all__ = ["Env", "ForwardModel", "GoalEnv", "Reach", "ReachConfig", "State", "Task", "VectorEnv"]
+__all__ = ["Env", "ForwardModel", "GoalEnv", "State", "Task", "VectorEnv"]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.kinematics import TABLE_1
-from arm5dof.envs import ReachConfig
+from arm5dof.envs.reach import ReachConfig
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.runtime.mjx import mjx

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from arm5dof.arm import load_arm
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks, Replay, Training, Transition, losses
 from arm5dof.ddpg.networks import Critic, gelu
-from arm5dof.envs import Reach, ReachConfig
+from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.errors import UserError
 from arm5dof.training.config import load_config
 

@@ -15,8 +15,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from helpers.environments import Bandit, Walk
 
-from arm5dof.envs import Reach, VectorEnv
+from arm5dof.envs import VectorEnv
 from arm5dof.envs.gym import GymEnv, GymGoalEnv, GymVectorEnv
+from arm5dof.envs.reach import Reach
 from arm5dof.errors import UserError
 
 ENVS, LENGTH, SEED = 6, 5, 7

@@ -13,7 +13,8 @@ from helpers.serial import serial_arm
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.kinematics import inverse
-from arm5dof.envs import GoalEnv, Reach, ReachConfig, State
+from arm5dof.envs import GoalEnv, State
+from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.errors import UserError
 
 ENVS, STEPS = 256, 160

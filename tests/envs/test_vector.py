@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from helpers.environments import Bandit, Walk
 
-from arm5dof.envs import Reach, State, VectorEnv
+from arm5dof.envs import State, VectorEnv
+from arm5dof.envs.reach import Reach
 
 ENVS, LENGTH = 16, 5
 

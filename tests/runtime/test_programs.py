@@ -11,7 +11,7 @@ import pytest
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.ddpg import DDPG
-from arm5dof.envs import Reach, ReachConfig
+from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.runtime import xla
 from arm5dof.runtime.programs import Program
 from arm5dof.training.config import Config, build

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm5dof.ddpg import DDPGConfig
-from arm5dof.envs import ReachConfig
+from arm5dof.envs.reach import ReachConfig
 from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.errors import UserError
 from arm5dof.runtime import files

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from arm5dof.ddpg import DDPG
-from arm5dof.envs import Reach
 from arm5dof.envs.metrics import Error
+from arm5dof.envs.reach import Reach
 from arm5dof.training import evaluate
 from arm5dof.training.config import load_config
 from arm5dof.training.policy import Policy

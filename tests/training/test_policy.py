@@ -10,7 +10,8 @@ from helpers.errors import said
 
 from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG, DDPGConfig
-from arm5dof.envs import Reach, State, Task
+from arm5dof.envs import State, Task
+from arm5dof.envs.reach import Reach
 from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
 from arm5dof.settings import settings, static
 from arm5dof.training.config import load_config
