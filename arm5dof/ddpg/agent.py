@@ -76,9 +76,6 @@ class DDPGConfig:
     """Transitions in an update."""
     updates_per_step: Count = static(default=128)
     """Updates after each step of all environments."""
-    actor_gain: Annotated[float, Ge(1)] = static(default=1.0)
-    """Actions are this times a tanh, cut off at -1 and 1: above 1, the ends of the range are reached without
-    saturation. For tasks whose answers lie at joint limits."""
     actor_width: Count = static(default=128)
     """Units in a hidden layer of the actor."""
     actor_depth: Count = static(default=3)
@@ -138,8 +135,7 @@ class DDPG:
         self.num_envs = num_envs
         self.total_steps = total_steps
         style = (config.activation, config.layer_norm)
-        head = (env.action_size, config.heads, config.actor_gain)
-        self.actor = Actor(*head, config.actor_width, config.actor_depth, *style)
+        self.actor = Actor(env.action_size, config.heads, config.actor_width, config.actor_depth, *style)
         self.critic = Critic(config.critic_form, config.critic_width, config.critic_depth, *style)
 
     def init(self, config: DDPGConfig, key: jax.Array) -> Training:

@@ -44,13 +44,11 @@ class Actor(nn.Module):
     """mu(s): observations (..., state) to `heads` candidate actions (..., heads, action_size) in [-1, 1].
 
     A single continuous map from targets to joint angles must tear somewhere: several heads can cover it in pieces.
-    They start from different random constants. With a gain above 1 the ends of the range are reached where tanh does
-    not saturate yet; what lies beyond is cut off, and gradients pass.
+    They start from different random constants.
     """
 
     action_size: int
     heads: int
-    gain: float
     width: int
     depth: int
     activation: str
@@ -60,11 +58,7 @@ class Actor(nn.Module):
     def __call__(self, obs: jax.Array) -> jax.Array:
         spread = nn.initializers.normal(0.5) if self.heads > 1 else nn.initializers.zeros_init()
         x = MLP(self.width, self.depth, self.heads * self.action_size, self.activation, self.layer_norm, spread)(obs)
-        action = jnp.tanh(x)
-        if self.gain != 1:
-            action = self.gain * action
-            action = action + jax.lax.stop_gradient(jnp.clip(action, -1, 1) - action)
-        return action.reshape(*obs.shape[:-1], self.heads, self.action_size)
+        return jnp.tanh(x).reshape(*obs.shape[:-1], self.heads, self.action_size)
 
 
 class Critic(nn.Module):
