@@ -58,7 +58,7 @@ class Act(Protocol):
 class Env(Protocol):
     """A pure environment without a batch axis. Actions are vectors in [-1, 1].
 
-    `step` sets `done` if the episode has ended for good, and keeps the entries of `info` that it does not know.
+    `step` sets `done` if the episode has ended for good.
     """
 
     @property

@@ -56,7 +56,7 @@ class VectorEnv:
         over = terminated | truncated | ~finite
 
         fresh = self._reset(state.info["key"])
-        continued = reached.replace(info={**reached.info, "steps": steps})
+        continued = reached.replace(info={**state.info, **reached.info, "steps": steps})
         new = _where(over, fresh, continued)
         return new.replace(
             reward=jnp.where(finite, reached.reward, 0.0),
