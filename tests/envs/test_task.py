@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from arm5dof.envs import State, Task
+from arm5dof.envs import State, Task, VectorEnv
 from arm5dof.envs.base import episode_returns
 from arm5dof.settings import settings, static
 from arm5dof.training import evaluate
@@ -89,6 +89,19 @@ def test_what_a_task_inherits():
     env.check()
     with pytest.raises(TypeError, match="abstract"):
         Task(CountdownConfig())
+
+
+def test_a_task_need_not_carry_what_others_keep_in_its_states():
+    batch = VectorEnv(Countdown(CountdownConfig()), episode_length=6)
+    state = jax.jit(batch.reset)(jax.random.split(jax.random.key(0), 8))
+    for t in range(1, 7):
+        before, state = state, jax.jit(batch.step)(state, jnp.zeros((8, 1)))
+        ended = (before.data == 1) | (before.info["steps"] == 5)
+        np.testing.assert_array_equal(state.done, ended)
+        np.testing.assert_array_equal(state.info["truncation"], ended & (before.data > 1))
+        np.testing.assert_array_equal(state.info["steps"], jnp.where(ended, 0, before.info["steps"] + 1))
+        np.testing.assert_array_equal(state.info["next_obs"]["state"][:, 0], before.data - 1)
+    assert t == 6 and (state.info["key"] != before.info["key"]).any()
 
 
 @pytest.fixture
