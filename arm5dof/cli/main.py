@@ -13,12 +13,10 @@ from arm5dof import __version__
 from arm5dof.cli import evaluate, solve, train, vision
 from arm5dof.cli.parser import Parser
 from arm5dof.errors import UserError
-from arm5dof.runtime import xla
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Returns the exit status: 0, 2 for bad input, 130 when interrupted."""
-    xla.enable_compilation_cache()
     warnings.showwarning = lambda message, *_, **__: print(f"arm5dof: {message}", file=sys.stderr)
     try:
         parser = make_parser()
@@ -26,6 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.command is None:
             parser.print_help()
             return 0
+        from arm5dof.runtime import xla  # Asks for versions, which takes as long as all else that help needs.
+
+        xla.enable_compilation_cache()
         return int(args.run(args, rest) or 0)
     except UserError as error:
         print(f"arm5dof: {error}", file=sys.stderr)

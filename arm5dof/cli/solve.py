@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from arm5dof.cli.parser import Parser, natural, nothing_left
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.envs import ForwardModel
@@ -68,6 +67,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.out is not None and args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
 
+    from arm5dof.runtime import files
     from arm5dof.training.run import Run
 
     policy = Run.open(folder).policy()
