@@ -24,10 +24,10 @@ class Policy(struct.PyTreeNode, eq=False):
     >>> import tempfile
     >>> from arm5dof import load_config, train
     >>> folder = tempfile.TemporaryDirectory()
-    >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 100}
-    >>> config = load_config("kinematic.toml", updates_per_step=1, **budget)  # Seconds, and far from enough.
+    >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "updates_per_step": 1}
+    >>> config = load_config("kinematic.toml", targets=100, refinements=1, **budget)  # Seconds: far from enough.
     >>> policy = train(config, f"{folder.name}/short").policy()
-    >>> answer = policy.solve([0.15, 0.05, 0.12], corrections=10)
+    >>> answer = policy.solve([0.15, 0.05, 0.12], corrections=2)
     >>> answer.q.shape, answer.outcome.shape, answer.errors["distance"].shape  # radians, metres, metres
     ((5,), (3,), ())
     >>> policy.solve([[0.15, 0.05, 0.12], [0.1, -0.1, 0.2]]).q.shape

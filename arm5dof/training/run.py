@@ -195,8 +195,8 @@ def train(settings: Config, folder: str | Path | None = None, reporter: Reporter
     >>> import tempfile
     >>> from arm5dof import load_config, train
     >>> folder = tempfile.TemporaryDirectory()
-    >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 100}
-    >>> config = load_config("kinematic.toml", updates_per_step=1, **budget)  # Seconds, and far from enough.
+    >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "updates_per_step": 1}
+    >>> config = load_config("kinematic.toml", targets=100, refinements=1, **budget)  # Seconds: far from enough.
     >>> run = train(config, f"{folder.name}/short")
     >>> run.evaluations[-1]["episodes"], run.metrics["env_steps"][-1], (run.folder / "report.md").exists()
     (2, 320.0, True)

@@ -203,7 +203,7 @@ def test_a_step_and_hindsight_say_the_same(env: ReachPose):
 
 def test_pointing_is_learnt_in_seconds():
     """By each of three seeds; one program serves them all."""
-    short = {"episodes": 40, "num_envs": 20, "evaluate_every": 20, "checkpoint_every": 20, "updates_per_step": 32}
+    short = {"episodes": 40, "num_envs": 20, "evaluate_every": 20, "checkpoint_every": 20, "updates_per_step": 48}
     config = load_config("reach_pose.toml", episode_length=64, refinements=0, **short)
     trainer = Trainer(ReachPose(config.env), config)
     for seed in range(3):

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -18,18 +19,26 @@ import tomli_w
 from helpers.errors import said
 
 from arm5dof.runtime import files
-from arm5dof.training import config
+from arm5dof.training import config, evaluate
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import load_config
 from arm5dof.training.run import Run, Silent, resume, train
 
 TINY = {
     **{"episodes": 4, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 40, "interim_targets": 40},
-    **{"episode_length": 16, "epoch_steps": 8, "refinements": 1, "replay_capacity": 1024, "batch_size": 16},
+    **{"episode_length": 16, "epoch_steps": 8, "refinements": 0, "replay_capacity": 1024, "batch_size": 16},
     **{"actor_width": 16, "actor_depth": 1, "critic_width": 8, "critic_depth": 1, "heads": 2, "updates_per_step": 2},
 }
 GOALS = [[0.15, 0.05, 0.12], [-0.1, 0.1, 0.2], [0.0, 0.2, 0.1]]
 MESH = "\n".join(["v 0 0 0", "v 0.01 0 0", "v 0 0.01 0", "v 0 0 0.01", "f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_chunk() -> Iterator[None]:
+    """All evaluations here are one program, whatever the number of targets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "CHUNK", 20)
+        yield
 
 
 class Told(Silent):
