@@ -2,6 +2,7 @@
 
     python experiments/learning.py budgets                    five seeds of each row, into experiments/results/
     python experiments/learning.py ablations --seeds 3
+    python experiments/learning.py poses                      positions and directions (reach_pose)
     python experiments/learning.py budgets --rows 25 --seeds 1   only rows with "25" in their name; nothing is written
 
 All rows are judged on 10,000 unseen targets at the end of training. Runs are left in runs/learning/ and resumed if they
@@ -73,7 +74,12 @@ ABLATIONS = {
 TEN_SEEDS = ("100 episodes, kinematic",)
 """Rows where a lottery would show."""
 
-TABLES = {"budgets": BUDGETS, "ablations": ABLATIONS}
+POSES = {
+    "five joints, approach": "reach_pose.toml",
+    "seven joints, rotation": "reach_pose7.toml",
+}
+
+TABLES = {"budgets": BUDGETS, "ablations": ABLATIONS, "poses": POSES}
 
 
 def main() -> None:
@@ -86,7 +92,7 @@ def main() -> None:
     rows = {name: line for name, line in TABLES[arguments.table].items() if arguments.rows in name}
     seeds = {name: max(arguments.seeds, 10) if name in TEN_SEEDS else arguments.seeds for name in rows}
     found = {name: [train(name, line, seed) for seed in range(seeds[name])] for name, line in rows.items()}
-    text = markdown(arguments.table, found, arguments.seeds)
+    text = (poses if arguments.table == "poses" else markdown)(arguments.table, found, arguments.seeds)
     print(text)
     if not arguments.rows:
         files.write_text(RESULTS / f"learning_{arguments.table}.json", json.dumps(found, indent=1) + "\n")
@@ -100,8 +106,8 @@ def train(name: str, line: str, seed: int) -> dict:
         return json.loads((RESULTS / line).read_text())[seed][-1]
     experiment, *options = line.split()
     overrides = {option[2:]: value for option, value in zip(options[::2], options[1::2], strict=True)}
-    episodes = overrides.get("episodes", "400")
-    settings = load_config(experiment, **{**overrides, "seed": seed, "evaluate-every": episodes})
+    settings = load_config(experiment, **{**overrides, "seed": seed})
+    settings = load_config(experiment, **{**overrides, "seed": seed, "evaluate-every": settings.train.episodes})
     folder = Path("runs") / "learning" / re.sub(r"\W+", "-", f"{name}-{seed}")
     opened = Run.open(folder) if folder.exists() else Run.create(settings, folder)
     if opened.config != settings:
@@ -109,14 +115,41 @@ def train(name: str, line: str, seed: int) -> dict:
     return resume(opened).evaluations[-1]
 
 
-def markdown(title: str, found: dict[str, list[dict]], seeds: int) -> str:
-    """Each row's worst and mean share of targets within a distance, and its mean median, over seeds."""
-    lines = [
+def heading(title: str, seeds: int) -> list[str]:
+    """What every table begins with."""
+    return [
         f"# Learning: {title}, 10,000 unseen targets",
         "",
         f"Command: `python experiments/learning.py {title} --seeds {seeds}`. {platform.machine()} CPU.",
         "Shares are the mean over seeds; in brackets the worst seed.",
         "",
+    ]
+
+
+def poses(title: str, found: dict[str, list[dict]], seeds: int) -> str:
+    """Mean errors of one answer, and the shares of goals that are met in both position and direction."""
+    lines = [
+        *heading(title, seeds),
+        "| | seeds | transitions | updates | one answer, mean error | <= 5 mm and 3 deg | corrected: <= 1 mm and 0.5 deg |",
+        "| --- |" + " ---: |" * 6,
+    ]
+    for name, evaluations in found.items():
+        first = evaluations[0]
+        mm, deg = (
+            scale * np.mean([e["means"][key] for e in evaluations])
+            for key, scale in (("one_shot", 1e3), ("one_shot_angle", 180 / np.pi))
+        )
+        shares = [np.array([e[f"{kind}_within"]["percent"] for e in evaluations]) for kind in ("one_shot", "refined")]
+        cells = " | ".join(f"{share.mean():.2f} % ({share.min():.2f})" for share in shares)
+        counts = f"{len(evaluations)} | {first['env_steps']} | {first['updates']}"
+        lines.append(f"| {name} | {counts} | {mm:.2f} mm, {deg:.2f} deg | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def markdown(title: str, found: dict[str, list[dict]], seeds: int) -> str:
+    """Each row's worst and mean share of targets within a distance, and its mean median, over seeds."""
+    lines = [
+        *heading(title, seeds),
         "| | seeds | transitions | updates | | median | <= 1 mm | <= 5 mm | <= 10 mm |",
         "| --- | ---: | ---: | ---: | --- |" + " ---: |" * 4,
     ]

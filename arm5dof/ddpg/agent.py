@@ -55,9 +55,10 @@ class DDPGConfig:
     they reach covers the workspace, and hindsight makes goals of it."""
     her_ratio: Unit = 0.8
     """Share of sampled transitions whose goal is exchanged in hindsight, where the task has goals."""
-    her_goals: Literal["buffer", "future"] = static(default="buffer")
+    her_goals: Literal["buffer", "future", "reset"] = static(default="buffer")
     """Where goals in hindsight come from. buffer: what any transition reached, for tasks of one step; future: what
-    was reached later in the same episode, for tasks of many."""
+    was reached later in the same episode, for tasks of many; reset: what a new episode would ask for, never the same
+    twice."""
     head_temperature: Positive = 0.01
     """How sharply heads divide the observations among them, in units of reward."""
     heads: Count = static(default=1)
@@ -69,13 +70,15 @@ class DDPGConfig:
     critic_input: Literal["outcome", "state"] = static(default="state")
     """state: the critic sees the observation and the action; outcome: it sees where the action leads by the task's
     forward model, as the paper's does."""
-    critic_form: Literal["scalar", "distance", "linear_distance"] = static(default="scalar")
-    """scalar: Q is any number; distance: Q is minus a learnt distance, for rewards that are minus a distance;
-    linear_distance: to what that learns, a linear function of the critic's input is added."""
+    critic_form: Literal["scalar", "distance", "linear"] = static(default="scalar")
+    """scalar: Q is any number; distance: Q is minus a learnt distance, for rewards that are minus a distance; linear:
+    minus the length of a linear function of the critic's input, which has no hidden layers then."""
     batch_size: Count = static(default=64)
     """Transitions in an update."""
     updates_per_step: Count = static(default=128)
     """Updates after each step of all environments."""
+    actor_products: bool = static(default=False)
+    """Whether the actor also sees the product of every pair of its observation's components."""
     actor_width: Count = static(default=128)
     """Units in a hidden layer of the actor."""
     actor_depth: Count = static(default=3)
@@ -135,7 +138,9 @@ class DDPG:
         self.num_envs = num_envs
         self.total_steps = total_steps
         style = (config.activation, config.layer_norm)
-        self.actor = Actor(env.action_size, config.heads, config.actor_width, config.actor_depth, *style)
+        self.actor = Actor(
+            env.action_size, config.heads, config.actor_products, config.actor_width, config.actor_depth, *style
+        )
         self.critic = Critic(config.critic_form, config.critic_width, config.critic_depth, *style)
 
     def init(self, config: DDPGConfig, key: jax.Array) -> Training:
@@ -195,6 +200,10 @@ class DDPG:
         """Which of the actor's heads the critic prefers for a batch of observations, (batch,) int32."""
         return self.value(config, critic, obs, self.candidates(actor, obs)).argmax(-1)
 
+    def ranking(self, config: DDPGConfig, actor: Params, critic: Params, obs: Observation) -> jax.Array:
+        """The actor's heads, the critic's favourite first, for a batch of observations, (batch, heads) int32."""
+        return jnp.argsort(self.value(config, critic, obs, self.candidates(actor, obs)), descending=True)
+
     def answer(self, actor: Params, obs: Observation, head: jax.Array) -> jax.Array:
         """The actions of given heads (batch,) for a batch of observations, (batch, action_size)."""
         return _pick(self.candidates(actor, obs), head)
@@ -253,21 +262,24 @@ class DDPG:
 
     def relabel(self, config: DDPGConfig, replay: Replay, rows: jax.Array, key: jax.Array) -> Transition:
         """The transitions in rows of the buffer (any leading axes), the goals of a share of them exchanged for what
-        others reached (Andrychowicz et al. 2017, hindsight experience replay). The reward for any goal is known, and
-        whether it ends the episode, so this is exact."""
+        others reached (Andrychowicz et al. 2017, hindsight experience replay) or for new ones (Nair et al. 2018). The
+        reward for any goal is known, and whether it ends the episode, so this is exact."""
         env, batch = self.goal_env, replay.read(rows)
         if env is None:
             return batch
         shape = batch.reward.shape
         choice_key, goal_key = jax.random.split(key)
         chosen = jax.random.uniform(choice_key, shape) < config.her_ratio
-        if config.her_goals == "buffer":
-            donors = replay.sample(goal_key, shape)
+        source: Any
+        if config.her_goals == "reset":
+            source, goal_of = jax.random.split(goal_key, shape), lambda key: env.reset(key).info["goal"]
         else:
-            donors = replay.later(goal_key, rows, self.episode_length)
+            buffer = config.her_goals == "buffer"
+            donors = replay.sample(goal_key, shape) if buffer else replay.later(goal_key, rows, self.episode_length)
+            source, goal_of = replay.read(donors).next_obs, env.achieved
 
-        def one(transition: Transition, donor: Observation, chosen: jax.Array) -> Transition:
-            goal = env.achieved(donor)
+        def one(transition: Transition, source: Any, chosen: jax.Array) -> Transition:
+            goal = goal_of(source)
             reward, terminal = env.goal_reward(env.achieved(transition.next_obs), goal, transition.action)
             changed = transition.replace(
                 obs=env.replace_goal(transition.obs, goal),
@@ -279,7 +291,7 @@ class DDPG:
 
         for _ in shape:
             one = jax.vmap(one)
-        return one(batch, replay.read(donors).next_obs, chosen)
+        return one(batch, source, chosen)
 
     def update(
         self, config: DDPGConfig, training: Training, batch: Transition, critic_input: jax.Array

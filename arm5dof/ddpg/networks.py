@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 EMBEDDING = 16
-"""Dimensions of the space in which a critic of the form "distance" measures."""
+"""Dimensions of the space in which a critic of the forms "distance" and "linear" measures."""
 
 
 def gelu(x: jax.Array) -> jax.Array:
@@ -44,11 +44,13 @@ class Actor(nn.Module):
     """mu(s): observations (..., state) to `heads` candidate actions (..., heads, action_size) in [-1, 1].
 
     A single continuous map from targets to joint angles must tear somewhere: several heads can cover it in pieces.
-    They start from different random constants.
+    They start from different random constants. With `products` the network sees, beside the observation, the product
+    of every pair of its components: lengths, moments and angles between directions are sums of these.
     """
 
     action_size: int
     heads: int
+    products: bool
     width: int
     depth: int
     activation: str
@@ -56,6 +58,9 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
+        if self.products:
+            i, j = jnp.triu_indices(obs.shape[-1])
+            obs = jnp.concatenate([obs, obs[..., i] * obs[..., j]], axis=-1)
         spread = nn.initializers.normal(0.5) if self.heads > 1 else nn.initializers.zeros_init()
         x = MLP(self.width, self.depth, self.heads * self.action_size, self.activation, self.layer_norm, spread)(obs)
         return jnp.tanh(x).reshape(*obs.shape[:-1], self.heads, self.action_size)
@@ -65,9 +70,9 @@ class Critic(nn.Module):
     """Q(s, a): what the critic sees of an observation and an action, (..., size), to values (...).
 
     In the form "distance" Q = -|MLP(x)|, the length of a learnt vector: where rewards are minus a distance (Eq. 7),
-    values have a tip at the goal that a smooth network rounds off. In "linear_distance" Q = -|A x + MLP(x)|: where the
-    critic sees the difference from the goal, A x can be the distance itself. "scalar" is a plain network with one
-    output.
+    values have a tip at the goal that a smooth network rounds off. In "linear" Q = -|A x|, without hidden layers: where
+    the critic sees the difference from the goal, that can be the distance itself. "scalar" is a plain network with
+    one output.
     """
 
     form: str
@@ -78,10 +83,9 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        size = 1 if self.form == "scalar" else EMBEDDING
-        out = MLP(self.width, self.depth, size, self.activation, self.layer_norm)(x)
-        if self.form == "scalar":
-            return out[..., 0]
-        if self.form == "linear_distance":
-            out = out + nn.Dense(size, use_bias=False)(x)
-        return -jnp.sqrt((out**2).sum(-1) + 1e-12)
+        if self.form == "linear":
+            out = nn.Dense(EMBEDDING, use_bias=False)(x)
+        else:
+            size = 1 if self.form == "scalar" else EMBEDDING
+            out = MLP(self.width, self.depth, size, self.activation, self.layer_norm)(x)
+        return out[..., 0] if self.form == "scalar" else -jnp.sqrt((out**2).sum(-1) + 1e-12)

@@ -42,7 +42,9 @@ class ArmGoalConfig:
     """Control steps in an episode; its end is a truncation."""
     substeps: Annotated[int, Ge(1)] = static(default=5)
     """Physics steps in a control step (servo): long enough for the servos to settle to within 1 %."""
-    refinements: Annotated[int, Ge(0)] = static(default=10)
+    branches: Annotated[int, Ge(1)] = static(default=1, may_change=True)
+    """How many of the policy's candidate answers are corrected, its preferred ones first; the best counts."""
+    refinements: Annotated[int, Ge(0)] = static(default=10, may_change=True)
     """How often the target is corrected for the `refined` and the `episode` figure of an evaluation."""
 
 
@@ -205,6 +207,11 @@ class ArmGoalEnv(Task):
     @property
     def joint_names(self) -> tuple[str, ...]:
         return self.arm.joint_names
+
+    @property
+    def branches(self) -> int:
+        """See `ForwardModel`."""
+        return int(self.config.branches)
 
     @property
     def workspace(self) -> str:

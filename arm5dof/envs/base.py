@@ -53,6 +53,10 @@ class Act(Protocol):
         call, it keeps a motion on one branch of solutions."""
         ...
 
+    def branches(self, obs: Observation) -> jax.Array:
+        """All of its candidate answers, the preferred one first, (n, branches) int32."""
+        ...
+
 
 @runtime_checkable
 class Env(Protocol):
@@ -195,6 +199,11 @@ class ForwardModel(GoalEnv, Protocol):
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joint positions that answer a goal."""
+        ...
+
+    @property
+    def branches(self) -> int:
+        """How many of a policy's candidate answers are followed where answers are corrected."""
         ...
 
     @property

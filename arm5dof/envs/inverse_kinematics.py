@@ -27,11 +27,22 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
     """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose.
 
     With `corrections` > 0 it is asked again as often, for goals shifted by the error that it was seen to make
-    (closed-loop target correction); the answer of the highest reward counts. No Jacobian is involved, and the branch
-    that the policy chose first is kept.
+    (closed-loop target correction); the answer of the highest reward counts. No Jacobian is involved, and each of the
+    candidate answers that are followed (`env.branches`) keeps to its branch.
     """
+    if not corrections or env.branches == 1:
+        return _follow(env, act, goals, act.branch(jax.vmap(env.question)(goals)), corrections)[0]
+    branches = act.branches(jax.vmap(env.question)(goals))[:, : env.branches]
+    answers, rewards = jax.lax.map(lambda branch: _follow(env, act, goals, branch, corrections), branches.T)
+    best = rewards.argmax(0)
+    return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
+
+
+def _follow(
+    env: ForwardModel, act: Act, goals: Goal, branch: jax.Array, corrections: int
+) -> tuple[Answer, jax.Array]:
+    """The best answers of given branches (n,), and their rewards (n,)."""
     observe = jax.vmap(env.question)
-    branch = act.branch(observe(goals))
 
     def ask(asked: Goal) -> tuple[Answer, jax.Array]:
         action = act(observe(asked), branch)
@@ -45,7 +56,7 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
         asked = jax.vmap(env.correct)(asked, answer.outcome, goals)
         answer, reward = ask(asked)
         best = choose(reward > best[1], (answer, reward), best)
-    return best[0]
+    return best
 
 
 def choose(mask: jax.Array, where_true: T, where_false: T) -> T:

@@ -63,6 +63,12 @@ class Policy(struct.PyTreeNode, eq=False):
             return self.branch(jax.tree.map(lambda x: jnp.asarray(x)[None], obs))[0]
         return self.agent.head(self.config, self.networks.actor, self.networks.critic, obs)
 
+    def branches(self, obs: Observation) -> jax.Array:
+        """All of the actor's heads, the critic's favourite first, (n, heads) int32, for observations as in a call."""
+        if _is_single(self.env, obs):
+            return self.branches(jax.tree.map(lambda x: jnp.asarray(x)[None], obs))[0]
+        return self.agent.ranking(self.config, self.networks.actor, self.networks.critic, obs)
+
     @property
     def forward_model(self) -> ForwardModel:
         """The task, if it tells where an action leads. Raises `UserError` if it does not."""
