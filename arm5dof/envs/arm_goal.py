@@ -42,8 +42,13 @@ class ArmGoalConfig:
     """Control steps in an episode; its end is a truncation."""
     substeps: Annotated[int, Ge(1)] = static(default=5)
     """Physics steps in a control step (servo): long enough for the servos to settle to within 1 %."""
+    correction: Literal["target", "jacobian"] = static(default="target", may_change=True)
+    """How answers are corrected. target: the policy is asked again, for a goal shifted by the error; jacobian: damped
+    least squares from the policy's answer, which also finds the nearest that the joint limits allow."""
     branches: Annotated[int, Ge(1)] = static(default=1, may_change=True)
     """How many of the policy's candidate answers are corrected, its preferred ones first; the best counts."""
+    restarts: Annotated[int, Ge(0)] = static(default=0, may_change=True)
+    """From how many random poses damped least squares starts beside, for goals that no answer came near (jacobian)."""
     refinements: Annotated[int, Ge(0)] = static(default=10, may_change=True)
     """How often the target is corrected for the `refined` and the `episode` figure of an evaluation."""
 
@@ -114,6 +119,10 @@ class ArmGoalEnv(Task):
 
     def goal_reward(self, achieved: Goal, goal: Goal, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """See `GoalEnv`."""
+        raise NotImplementedError
+
+    def residual(self, achieved: Goal, goal: Goal) -> jax.Array:
+        """See `ForwardModel`."""
         raise NotImplementedError
 
     def correct(self, asked: Goal, achieved: Goal, goal: Goal) -> Goal:
@@ -209,9 +218,19 @@ class ArmGoalEnv(Task):
         return self.arm.joint_names
 
     @property
+    def correction(self) -> Literal["target", "jacobian"]:
+        """See `ForwardModel`."""
+        return self.config.correction
+
+    @property
     def branches(self) -> int:
         """See `ForwardModel`."""
-        return int(self.config.branches)
+        return self.config.branches
+
+    @property
+    def restarts(self) -> int:
+        """See `ForwardModel`."""
+        return self.config.restarts
 
     @property
     def workspace(self) -> str:

@@ -202,8 +202,18 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
+    def correction(self) -> Literal["target", "jacobian"]:
+        """How answers are corrected: see `inverse_kinematics.solve`."""
+        ...
+
+    @property
     def branches(self) -> int:
         """How many of a policy's candidate answers are followed where answers are corrected."""
+        ...
+
+    @property
+    def restarts(self) -> int:
+        """From how many random actions damped least squares starts beside."""
         ...
 
     @property
@@ -230,6 +240,10 @@ class ForwardModel(GoalEnv, Protocol):
 
     def errors(self, achieved: Goal, goal: Goal) -> dict[str, jax.Array]:
         """How far one goal is from another, by component: () each, metres or radians."""
+        ...
+
+    def residual(self, achieved: Goal, goal: Goal) -> jax.Array:
+        """The difference between two goals as a vector, whose length the reward is minus, or nearly. Metres."""
         ...
 
     def correct(self, asked: Goal, achieved: Goal, goal: Goal) -> Goal:

@@ -1,7 +1,8 @@
-"""Inverse kinematics by a policy: goals in, joint positions out, and a loop that corrects what to ask for."""
+"""Inverse kinematics by a policy: goals in, joint positions out, and a loop that corrects the answers."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -10,6 +11,10 @@ import jax.numpy as jnp
 from arm5dof.envs.base import Act, ForwardModel, Goal
 
 T = TypeVar("T")
+DAMPING = 1e-4
+"""Of the first step, square metres: less than the square of what a joint's whole range moves."""
+LIMIT = 1e-4
+"""Actions nearer to a limit count as at it: an actor's tanh only comes near."""
 
 
 class Answer(NamedTuple):
@@ -26,37 +31,64 @@ class Answer(NamedTuple):
 def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
     """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose.
 
-    With `corrections` > 0 it is asked again as often, for goals shifted by the error that it was seen to make
-    (closed-loop target correction); the answer of the highest reward counts. No Jacobian is involved, and each of the
-    candidate answers that are followed (`env.branches`) keeps to its branch.
+    With `corrections` > 0 each of the candidate answers that are followed (`env.branches`) is corrected as often, on
+    its own branch, and the one of the highest reward counts. How is for the task to say (`env.correction`): "target"
+    asks the policy again, for goals shifted by the error that it was seen to make, with no Jacobian; "jacobian" takes
+    steps of damped least squares within the joint limits, also from a few random poses (`env.restarts`).
     """
-    if not corrections or env.branches == 1:
-        return _follow(env, act, goals, act.branch(jax.vmap(env.question)(goals)), corrections)[0]
-    branches = act.branches(jax.vmap(env.question)(goals))[:, : env.branches]
-    answers, rewards = jax.lax.map(lambda branch: _follow(env, act, goals, branch, corrections), branches.T)
-    best = rewards.argmax(0)
-    return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
-
-
-def _follow(
-    env: ForwardModel, act: Act, goals: Goal, branch: jax.Array, corrections: int
-) -> tuple[Answer, jax.Array]:
-    """The best answers of given branches (n,), and their rewards (n,)."""
     observe = jax.vmap(env.question)
 
-    def ask(asked: Goal) -> tuple[Answer, jax.Array]:
-        action = act(observe(asked), branch)
+    def judge(action: jax.Array) -> tuple[Answer, jax.Array]:
         outcome = jax.vmap(env.outcome)(action)
         reward, _ = jax.vmap(env.goal_reward)(outcome, goals, action)
         return Answer(jax.vmap(env.joints)(action), outcome, jax.vmap(env.errors)(outcome, goals)), reward
 
-    asked = goals
-    best = answer, reward = ask(goals)
-    for _ in range(corrections):
-        asked = jax.vmap(env.correct)(asked, answer.outcome, goals)
-        answer, reward = ask(asked)
-        best = choose(reward > best[1], (answer, reward), best)
-    return best
+    def follow(branch: jax.Array) -> tuple[Answer, jax.Array]:
+        asked = goals
+        best = answer, reward = judge(act(observe(goals), branch))
+        for _ in range(corrections):
+            asked = jax.vmap(env.correct)(asked, answer.outcome, goals)
+            answer, reward = judge(act(observe(asked), branch))
+            best = choose(reward > best[1], (answer, reward), best)
+        return best
+
+    def descend(action: jax.Array) -> tuple[Answer, jax.Array]:
+        return judge(jax.vmap(partial(_descend, env, corrections))(action, goals))
+
+    obs = observe(goals)
+    if not corrections or (env.correction == "target" and env.branches == 1):
+        return follow(act.branch(obs))[0]
+    branches = act.branches(obs)[:, : env.branches].T
+    if env.correction == "target":
+        answers, rewards = jax.lax.map(follow, branches)
+    else:
+        first = jax.lax.map(partial(act, obs), branches)
+        random = jax.random.uniform(jax.random.key(0), (env.restarts, *first.shape[1:]), minval=-1, maxval=1)
+        answers, rewards = jax.lax.map(descend, jnp.concatenate([first, random]))
+    best = rewards.argmax(0)
+    return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
+
+
+def _descend(env: ForwardModel, steps: int, action: jax.Array, goal: Goal) -> jax.Array:
+    """Levenberg-Marquardt from one action (action_size,) to where the residual is smallest within [-1, 1]. An action
+    at a limit that it would cross stays there for that step."""
+
+    def residual(action: jax.Array) -> jax.Array:
+        return env.residual(env.outcome(action), goal)
+
+    def step(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], None]:
+        action, damping = carry
+        now, jacobian = residual(action), jax.jacfwd(residual)(action)
+        gradient = jacobian.T @ now
+        free = (jnp.abs(action) < 1) | (action * gradient > 0)
+        jacobian = jacobian * free
+        normal = jacobian.T @ jacobian + jnp.diag(jnp.where(free, damping, 1.0))
+        moved = jnp.clip(action - jnp.linalg.solve(normal, gradient * free), -1, 1)
+        better = (residual(moved) ** 2).sum() < (now**2).sum()
+        return (jnp.where(better, moved, action), damping * jnp.where(better, 0.1, 10.0)), None
+
+    edge = jnp.where(jnp.abs(action) > 1 - LIMIT, jnp.sign(action), action)
+    return jax.lax.scan(step, (edge, jnp.asarray(DAMPING)), None, steps)[0][0]
 
 
 def choose(mask: jax.Array, where_true: T, where_false: T) -> T:

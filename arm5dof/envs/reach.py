@@ -67,6 +67,9 @@ class Reach(ArmGoalEnv):
         """Eq. 7: minus the distance, metres. It never ends an episode."""
         return -self.errors(achieved, goal)["distance"], jnp.zeros(())
 
+    def residual(self, achieved: jax.Array, goal: jax.Array) -> jax.Array:
+        return achieved - goal
+
     def correct(self, asked: jax.Array, achieved: jax.Array, goal: jax.Array) -> jax.Array:
         """Shifted by the error."""
         return asked + goal - achieved

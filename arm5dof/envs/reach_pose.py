@@ -109,6 +109,15 @@ class ReachPose(ArmGoalEnv):
         error = self.errors(achieved, goal)
         return -jnp.hypot(error["distance"], self.config.metres_per_radian * error["angle"]), jnp.zeros(())
 
+    def residual(self, achieved: PoseGoal, goal: PoseGoal) -> jax.Array:
+        """The shift, and how far the tips of all directions lie apart, `metres_per_radian` long; of a rotation half of
+        their squares, since each angle moves two of the three axes."""
+        if self._points:
+            turn = (achieved.directions - goal.directions).ravel()
+        else:
+            turn = (_matrix(achieved) - _matrix(goal)).ravel() / 2**0.5
+        return jnp.concatenate([achieved.position - goal.position, self.config.metres_per_radian * turn])
+
     def correct(self, asked: PoseGoal, achieved: PoseGoal, goal: PoseGoal) -> PoseGoal:
         """Shifted by the error of the position, and turned by that of the directions."""
         if self._points:

@@ -15,10 +15,11 @@ import pytest
 from helpers.environments import Bandit, Loan, Salary, Toy, Walk
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import kstest
 
 from arm5dof.arm import load_arm
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks, Replay, Training, Transition, losses
-from arm5dof.ddpg.networks import Critic, gelu
+from arm5dof.ddpg.networks import Actor, Critic, gelu
 from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.errors import UserError
 from arm5dof.training.config import load_config
@@ -449,6 +450,21 @@ def test_a_distance_critic_keeps_the_tip_of_a_distance():
     rounded = jnp.abs(errors(scalar, fitted(scalar), near)[1]).mean()
     assert jnp.abs(error).mean() < min(0.02, rounded / 3)
 
+    linear = Critic("linear", width=32, depth=2, activation="gelu", layer_norm=False)
+    assert jnp.abs(errors(linear, fitted(linear), near)[1]).mean() < abs(error).mean() / 2, (
+        "a distance is the length of a linear map"
+    )
+
+
+def test_an_actor_may_see_products():
+    obs = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+    style = {"action_size": 2, "heads": 3, "width": 8, "depth": 2, "activation": "gelu", "layer_norm": False}
+    plain, products = Actor(products=False, **style), Actor(products=True, **style)
+    (a, b, c) = obs.T
+    seen = np.stack([a, b, c, a * a, a * b, a * c, b * b, b * c, c * c], -1)
+    params = products.init(jax.random.key(0), obs)
+    np.testing.assert_allclose(products.apply(params, obs), plain.apply(params, seen), atol=1e-6)
+
 
 def test_gelu_is_about_gelu():
     x = jnp.linspace(-8, 8, 1001)
@@ -799,6 +815,23 @@ class Button(Toy):
     def goal_reward(self, achieved: jax.Array, goal: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = (jnp.abs(achieved - goal)[0] < 0.3).astype(float)
         return there - 1, there
+
+
+def test_goals_may_be_those_of_new_episodes():
+    config = replace(SMALL, her_ratio=1.0, her_goals="reset")
+    agent = DDPG(Button(), config, num_envs=4, episode_length=12, total_steps=100)
+    training, _ = jax.jit(agent.epoch, static_argnames="steps")(config, agent.init(config, jax.random.key(0)), steps=9)
+    replay = training.replay
+    rows = replay.sample(jax.random.key(1), (20, 100))
+    old, new = replay.read(rows), agent.relabel(config, replay, rows, jax.random.key(2))
+    goal = np.asarray(new.obs["state"][..., 1])
+    assert len(np.unique(goal)) > 1990, "each transition has its own"
+    assert kstest(goal.ravel(), "uniform", (-3, 6)).pvalue > 1e-3, "as `reset` draws them"
+    there = np.abs(np.asarray(old.next_obs["state"][..., 0]) - goal) < 0.3
+    np.testing.assert_array_equal(new.terminal, there)
+    np.testing.assert_array_equal(new.reward, there - 1.0)
+    np.testing.assert_array_equal(new.next_obs["state"][..., 1], goal)
+    np.testing.assert_array_equal(new.obs["state"][..., 0], old.obs["state"][..., 0])
 
 
 def test_hindsight_recomputes_reward_and_terminal_and_draws_later_goals():

@@ -11,7 +11,8 @@ from helpers.errors import said
 from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG, DDPGConfig
 from arm5dof.envs import State, Task
-from arm5dof.envs.reach import Reach
+from arm5dof.envs.inverse_kinematics import solve
+from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
 from arm5dof.settings import settings, static
 from arm5dof.training.config import load_config
@@ -137,6 +138,44 @@ def test_a_policy_takes_one_observation_or_many(policy: Policy):
     np.testing.assert_allclose(act(one, other[3]), act(obs, other)[3], atol=1e-6)
     assert np.abs(act(one, other[3]) - actions[3]).max() > 1e-3
     np.testing.assert_array_equal(act(jax.tree.map(np.asarray, obs)), actions)
+
+
+def test_branches_are_the_heads_in_the_critics_order(policy: Policy):
+    obs = jax.jit(jax.vmap(policy.env.reset))(jax.random.split(jax.random.key(1), 7)).obs
+    branches = policy.branches(obs)
+    np.testing.assert_array_equal(np.sort(branches, axis=1), np.tile(np.arange(3), (7, 1)))
+    np.testing.assert_array_equal(branches[:, 0], policy.branch(obs))
+    agent, config, networks = policy.agent, policy.config, policy.networks
+    value = agent.value(config, networks.critic, obs, agent.candidates(networks.actor, obs))
+    assert (np.diff(np.take_along_axis(np.asarray(value), np.asarray(branches), 1)) <= 0).all()
+    np.testing.assert_array_equal(policy.branches(jax.tree.map(lambda x: x[3], obs)), branches[3])
+
+
+@pytest.mark.parametrize("followed", [2, 3])
+def test_corrections_follow_several_branches(arm: Arm, followed: int):
+    """The best of what each branch comes to when it is followed alone."""
+    env = Reach(ReachConfig(dynamics="kinematic", branches=followed), arm)
+    policy, single = untrained(env), Reach(ReachConfig(dynamics="kinematic"), arm)
+    goals = jax.vmap(env.sample_goal)(jax.random.split(jax.random.key(4), 50))
+    order = policy.branches(jax.vmap(env.question)(goals))
+
+    class Alone:
+        def __init__(self, rank: int) -> None:
+            self.rank = rank
+
+        def __call__(self, obs, branch=None):
+            return policy(obs, branch)
+
+        def branch(self, obs):
+            return order[:, self.rank]
+
+    errors = np.stack([solve(single, Alone(rank), goals, 3).errors["distance"] for rank in range(followed)])
+    found = policy.solve(np.asarray(goals), corrections=3)
+    np.testing.assert_allclose(found.errors["distance"], errors.min(0), atol=1e-6)
+    assert (errors.argmin(0) > 0).any()
+    np.testing.assert_allclose(env.arm.forward(found.q), found.outcome, atol=1e-6)
+    first = policy.solve(np.asarray(goals))
+    np.testing.assert_allclose(first.errors["distance"], solve(single, policy, goals, 0).errors["distance"], atol=1e-6)
 
 
 def test_a_policy_says_what_it_acts_on(policy: Policy):
