@@ -31,7 +31,7 @@ A CSV has a header with x, y and z, and whatever else the run's task wants to kn
 reached within the tolerances.
 """
 
-Inputs = dict[str, list[list[float]]]
+Inputs = dict[str, Any]
 """What people state of n goals: rows of numbers by the names of the task's goal inputs."""
 
 

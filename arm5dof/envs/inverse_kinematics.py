@@ -29,19 +29,25 @@ class Answer(NamedTuple):
 
 
 def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
-    """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose.
+    """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose: its preferred answer, or
+    with `corrections` > 0 of all `candidates` the one of the highest reward."""
+    if corrections:
+        answers, rewards = candidates(env, act, goals, corrections)
+        best = rewards.argmax(0)
+        return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
+    return _judge(env, goals, act(jax.vmap(env.question)(goals)))[0]
 
-    With `corrections` > 0 each of the candidate answers that are followed (`env.branches`) is corrected as often, on
-    its own branch, and the one of the highest reward counts. How is for the task to say (`env.correction`): "target"
-    asks the policy again, for goals shifted by the error that it was seen to make, with no Jacobian; "jacobian" takes
-    steps of damped least squares within the joint limits, also from a few random poses (`env.restarts`).
+
+def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> tuple[Answer, jax.Array]:
+    """Several answers to each goal, (candidates, n), the policy's preferred one first, and their rewards.
+
+    Those that are followed (`env.branches`) are corrected so often, each on its own branch. How is for the task to say
+    (`env.correction`): "target" asks the policy again, for goals shifted by the error that it was seen to make, with
+    no Jacobian; "jacobian" takes steps of damped least squares within the joint limits, also from a few random poses
+    (`env.restarts`).
     """
     observe = jax.vmap(env.question)
-
-    def judge(action: jax.Array) -> tuple[Answer, jax.Array]:
-        outcome = jax.vmap(env.outcome)(action)
-        reward, _ = jax.vmap(env.goal_reward)(outcome, goals, action)
-        return Answer(jax.vmap(env.joints)(action), outcome, jax.vmap(env.errors)(outcome, goals)), reward
+    judge = partial(_judge, env, goals)
 
     def follow(branch: jax.Array) -> tuple[Answer, jax.Array]:
         asked = goals
@@ -56,17 +62,20 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
         return judge(jax.vmap(partial(_descend, env, corrections))(action, goals))
 
     obs = observe(goals)
-    if not corrections or (env.correction == "target" and env.branches == 1):
-        return follow(act.branch(obs))[0]
-    branches = act.branches(obs)[:, : env.branches].T
     if env.correction == "target":
-        answers, rewards = jax.lax.map(follow, branches)
-    else:
-        first = jax.lax.map(partial(act, obs), branches)
-        random = jax.random.uniform(jax.random.key(0), (env.restarts, *first.shape[1:]), minval=-1, maxval=1)
-        answers, rewards = jax.lax.map(descend, jnp.concatenate([first, random]))
-    best = rewards.argmax(0)
-    return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
+        if env.branches == 1:
+            return jax.tree.map(lambda x: x[None], follow(act.branch(obs)))
+        return jax.lax.map(follow, act.branches(obs)[:, : env.branches].T)
+    first = jax.lax.map(partial(act, obs), act.branches(obs)[:, : env.branches].T)
+    random = jax.random.uniform(jax.random.key(0), (env.restarts, *first.shape[1:]), minval=-1, maxval=1)
+    return jax.lax.map(descend, jnp.concatenate([first, random]))
+
+
+def _judge(env: ForwardModel, goals: Goal, action: jax.Array) -> tuple[Answer, jax.Array]:
+    """Actions (n, action_size) as answers to goals, and their rewards (n,)."""
+    outcome = jax.vmap(env.outcome)(action)
+    reward, _ = jax.vmap(env.goal_reward)(outcome, goals, action)
+    return Answer(jax.vmap(env.joints)(action), outcome, jax.vmap(env.errors)(outcome, goals)), reward
 
 
 def _descend(env: ForwardModel, steps: int, action: jax.Array, goal: Goal) -> jax.Array:

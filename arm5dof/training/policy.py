@@ -11,9 +11,9 @@ import numpy as np
 from flax import struct
 
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks
-from arm5dof.envs import ForwardModel, Task
+from arm5dof.envs import ForwardModel, Task, inverse_kinematics
 from arm5dof.envs.base import Goal, Observation
-from arm5dof.envs.inverse_kinematics import Answer, solve
+from arm5dof.envs.inverse_kinematics import Answer
 from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
 
@@ -76,7 +76,7 @@ class Policy(struct.PyTreeNode, eq=False):
             raise UserError(f"the task {type(self.env).__name__} has no forward model: its policy only acts")
         return self.env
 
-    def solve(self, *target: Any, corrections: int = 0, **inputs: Any) -> Answer:
+    def solve(self, *target: Any, corrections: int = 0, candidates: bool = False, **inputs: Any) -> Answer:
         """Inverse kinematics: ask for joint positions that lead to goals, from the arm's home pose.
 
         Args:
@@ -84,6 +84,8 @@ class Policy(struct.PyTreeNode, eq=False):
                 several, (n, 3).
             corrections: How often the policy is asked again for a goal shifted by the error it was seen to make
                 (closed-loop target correction). The best answer counts.
+            candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the policy's
+                preferred one first: with an axis (candidates,) after that of the goals. Some may be far off.
             inputs: The goal inputs by name: `target=...`, and for `reach_pose` `approach=...` (3,) or (n, 3), or
                 `quaternion=...` (4,) or (n, 4), w first.
 
@@ -108,7 +110,7 @@ class Policy(struct.PyTreeNode, eq=False):
         if len({len(leaf) for leaf in jax.tree.leaves(goals)}) > 1:
             raise UserError(f"solve takes as many of each of {' and '.join(names)}")
         single = all(np.ndim(values) == 1 for values in given.values())
-        answer = _solve(model, self, goals, corrections)
+        answer = _solve(model, self, goals, corrections, candidates)
         return jax.tree.map(lambda x: x[0], answer) if single else answer
 
     def _table(self) -> Table:
@@ -130,10 +132,12 @@ class Policy(struct.PyTreeNode, eq=False):
         return self._table().html()
 
 
-@partial(jax.jit, static_argnames=("env", "corrections"))
-def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
+@partial(jax.jit, static_argnames=("env", "corrections", "every"))
+def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int, every: bool) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
-    return solve(env, policy, goals, corrections)
+    if every:
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), inverse_kinematics.candidates(env, policy, goals, corrections)[0])
+    return inverse_kinematics.solve(env, policy, goals, corrections)
 
 
 def _is_single(env: Task, obs: Any) -> bool:
