@@ -36,6 +36,9 @@ TIME_STEP = 0.002
 FRICTION = (0.8, 0.005, 0.0002)
 """Coulomb's coefficient; then against spinning and rolling, metres: two thirds of the radius of a finger pad's contact,
 and what a ball of wood or plastic has on a table."""
+SOLREF, SOLIMP = (2 * TIME_STEP, 1.0), (0.95, 0.99, 0.0003, 0.5, 2.0)
+"""Contacts as hard as the time step allows: MuJoCo's own are made for heavier objects, and let fingers 4 mm into a ball
+of 8 g, from which a grip creeps."""
 DENSITY = 600.0
 """Of objects and distractors, kg/m^3: wood."""
 ARM_BIT, OBJECT_BIT = 1, 2
@@ -182,10 +185,9 @@ def tabletop_scene(
     layout = random_layout(seed, style, spec, count, radii, objects)
     builder, spec = layout.builder, layout.builder.spec
     _set_options(spec)
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], group=3, contype=0, conaffinity=ARM_BIT | OBJECT_BIT,
-        friction=friction, condim=3,
-    )  # fmt: skip
+    # The table that is seen is a box, against which the sides of a ring make many contacts more.
+    table = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], group=3)
+    _make_solid([table], 0, ARM_BIT | OBJECT_BIT, friction)
     placed_bins = _place_bins(spec, bins, radii[1], friction)
     density = DENSITY * disturbance.mass
     for i in range(len(layout.objects)):
@@ -240,7 +242,8 @@ def _set_options(spec: mujoco.MjSpec) -> None:
 
 def _make_solid(geoms: Sequence[mujoco.MjsGeom], contype: int, conaffinity: int, friction: np.ndarray) -> None:
     for geom in geoms:
-        geom.contype, geom.conaffinity, geom.friction, geom.condim, geom.priority = contype, conaffinity, friction, 3, 0
+        geom.contype, geom.conaffinity, geom.condim, geom.priority = contype, conaffinity, 3, 0
+        geom.friction, geom.solref, geom.solimp, geom.solmix, geom.margin, geom.gap = friction, SOLREF, SOLIMP, 1, 0, 0
 
 
 def _make_movable(body: mujoco.MjsBody, density: float, friction: np.ndarray) -> None:
