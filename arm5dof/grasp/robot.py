@@ -15,7 +15,7 @@ import numpy as np
 from arm5dof.arm import Arm
 from arm5dof.errors import UserError
 from arm5dof.grasp.scene import STILL, TabletopScene
-from arm5dof.vision.rendering.simulated import BackEnd, simulated_camera
+from arm5dof.vision.rendering.simulated import BackEnd, SimulatedCamera, simulated_camera
 from arm5dof.vision.synthetic.samples import HEIGHT, WIDTH
 from arm5dof.vision.synthetic.scene_builder import CAMERA
 
@@ -79,7 +79,7 @@ class SimulatedRobot:
     ) -> None:
         self._model, self._data, self._arm, self._gripper = scene.model, scene.data, scene.arm, scene.gripper
         self._size, self._back_end = (width, height), back_end
-        self._renderer = None
+        self._renderer: SimulatedCamera | None = None
         self._on_step, self._steps, self._stride = on_step, 0, max(1, round(every / self._model.opt.timestep))
         self._target = self.joints()
         self._fingers = self._data.qpos[self._gripper.qpos].copy()
@@ -107,9 +107,7 @@ class SimulatedRobot:
         target = self._gripper.fingers(opening)
         count = self._count(np.abs(target - self._fingers).max() / FINGER_SPEED)
         targets = np.linspace(self._fingers, target, count + 1)[1:]
-        self._follow(
-            self._gripper.actuators, np.stack([self._gripper.to_ctrl(t) for t in targets]), self._gripper.dofs
-        )
+        self._follow(self._gripper.actuators, np.stack([self._gripper.to_ctrl(t) for t in targets]), self._gripper.dofs)
         self._fingers = target
 
     def image(self) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Tabletop scenes with contacts: the detector's random scenes, in which objects have mass and are held by friction.
 
-A scene looks as `random_scene` draws it, but for the bins; what differs is what the eye cannot see. The paper lying on
-the table is thinner than a contact is deep and stays a picture.
+A scene looks as `random_scene` draws it, but for the bins. Paper on the table is only seen.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import numpy as np
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.errors import UserError
+from arm5dof.grasp.bins import HALF, Bin, arrange
 from arm5dof.grasp.gripper import SITE, Gripper
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.objects import CLASS_NAMES
@@ -24,10 +24,10 @@ from arm5dof.vision.synthetic.scenes import (
     MAX_OBJECTS,
     MAX_RADIUS,
     MIN_RADIUS,
-    PlacedObject,
     Placement,
     Scene,
     Style,
+    placed_objects,
     random_layout,
 )
 
@@ -45,16 +45,6 @@ ARM_BIT, OBJECT_BIT = 1, 2
 """The arm collides with all but itself, objects with all, table and bins with what moves."""
 STILL = 0.01
 """What moves slower is at rest, m/s and rad/s."""
-
-FAR_ROW, NEAR_ROW = 0.86, 0.52
-"""Distances of the bins from the arm's axis, as shares of that of the furthest objects: the tool can point straight down
-in both rows, even from above a bin's wall."""
-BIN_AZIMUTHS = ((FAR_ROW, 121), (FAR_ROW, 143), (NEAR_ROW, 139), (FAR_ROW, 165))
-"""Row and azimuth to either side of the x axis, degrees, best first. Objects lie within 100 degrees and no bin comes
-nearer to one than a finger is thick; the arm turns to what is behind it without passing over the objects again."""
-BIN_HALF, BIN_WALL, BIN_HEIGHT = 0.035, 0.002, 0.02
-"""Half the outer width, thickness and height of a bin's walls, metres: the longest object fits in whichever way it is
-turned, and fingers 6 mm below its center stay above the walls."""
 
 
 @dataclass(frozen=True)
@@ -77,32 +67,17 @@ UNDISTURBED = Disturbance()
 
 
 @dataclass(frozen=True, eq=False)
-class Bin:
-    """A low open box on the table."""
-
-    name: str
-    position: np.ndarray
-    """Of its middle on the table, (2,), metres, base frame."""
-    yaw: float
-    """About z, radians."""
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3), metres, base frame, are inside its walls and below their rims, (n,) bool."""
-        along = np.array([np.cos(self.yaw), np.sin(self.yaw)])
-        local = (points[:, :2] - self.position) @ np.stack([along, [-along[1], along[0]]], -1)
-        return (np.abs(local).max(-1) < BIN_HALF - BIN_WALL) & (points[:, 2] < BIN_HEIGHT + 0.005)
-
-
-@dataclass(frozen=True, eq=False)
 class TabletopScene(Scene):
     """A scene that can be stepped. What it says about its objects is the ground truth, for scoring alone."""
 
     arm: Arm
     """Its end effector is the site between the fingers."""
     gripper: Gripper
+    """Which the arm carries."""
     camera: Camera
     """As calibrated, which is where it stands unless it was moved since."""
     bins: dict[str, Bin]
+    """By name."""
     start: np.ndarray = field(repr=False)
     """The objects' positions before anything moved, (n, 3), metres."""
 
@@ -142,7 +117,7 @@ def tabletop_scene(
     seed: int | tuple[int, ...],
     style: Style = "evaluation",
     *,
-    arm: str | Path | mujoco.MjSpec = "arm5.xml",
+    arm: str | Path = "arm5.xml",
     count: tuple[int, int] = (3, MAX_OBJECTS),
     radii: tuple[float, float] = (MIN_RADIUS, MAX_RADIUS),
     objects: Sequence[Placement] | None = None,
@@ -156,7 +131,7 @@ def tabletop_scene(
     Args:
         seed: 0 or more; a tuple, such as (run, number), is a seed too.
         style: Its textures and lights.
-        arm: MJCF of an arm with a gripper and the site `grasp` between its fingers.
+        arm: MJCF file of an arm, the user's or one that ships, with a gripper and the site `grasp` between its fingers.
         count: The least and the greatest number of objects; fewer where there is no room.
         radii: How near and how far from the arm's axis they lie, metres.
         objects: The objects themselves, in place of random ones.
@@ -172,64 +147,47 @@ def tabletop_scene(
     Raises:
         UserError: The seed is negative, there is no such style, too many bins, or the arm has no gripper.
     """
-    loaded = load_arm(arm, SITE)
-    assert loaded.mj_spec is not None  # It comes from MJCF.
-    spec = loaded.mj_spec.copy()
-    Gripper.of(loaded.mj_model)
-    fingers = {loaded.mj_model.geom(g).id for g in Gripper.of(loaded.mj_model).geoms}
     friction = np.array(FRICTION) * disturbance.friction
-    _make_solid(spec.geoms, ARM_BIT, 0, friction)
-    for g in fingers:
-        spec.geoms[g].condim = 4
-
-    layout = random_layout(seed, style, spec, count, radii, objects)
-    builder, spec = layout.builder, layout.builder.spec
+    layout = random_layout(seed, style, _solid_arm(arm, friction), count, radii, objects)
+    spec = layout.builder.spec
     _set_options(spec)
     # The table that is seen is a box, against which the sides of a ring make many contacts more.
     table = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], group=3)
-    _make_solid([table], 0, ARM_BIT | OBJECT_BIT, friction)
-    placed_bins = _place_bins(spec, bins, radii[1], friction)
-    density = DENSITY * disturbance.mass
+    placed_bins = arrange(bins, radii[1])
+    walls = [wall for one in placed_bins.values() for wall in one.add_to(spec)]
+    _make_solid([table, *walls], 0, ARM_BIT | OBJECT_BIT, friction)
     for i in range(len(layout.objects)):
-        _make_movable(spec.body(f"object {i}"), density, friction)
+        _make_movable(spec.body(f"object {i}"), DENSITY * disturbance.mass, friction)
     for i, (position, radius) in enumerate(layout.distractors):
-        body = spec.body(f"distractor {i}")
-        apart = all(
-            np.hypot(*(position[:2] - one.position)) > radius + BIN_HALF * np.sqrt(2) for one in placed_bins.values()
+        in_the_way = any(
+            np.hypot(*(position[:2] - one.position)) < radius + np.sqrt(2) * HALF for one in placed_bins.values()
         )
-        if distractors and apart:
-            _make_movable(body, density, friction)
+        if distractors and not in_the_way:
+            _make_movable(spec.body(f"distractor {i}"), DENSITY * disturbance.mass, friction)
         else:
-            spec.delete(body)
+            spec.delete(spec.body(f"distractor {i}"))
 
-    model = builder.compile()
-    model.light_diffuse *= disturbance.light
-    model.light_specular *= disturbance.light
-    for name in ("ambient", "diffuse", "specular"):
-        getattr(model.vis.headlight, name)[:] *= disturbance.light
-    data = mujoco.MjData(model)
-    data.qpos[: len(layout.pose)] = layout.pose
+    model = layout.builder.compile()
+    calibrated = Camera.from_mujoco(model, CAMERA, WIDTH, HEIGHT)
+    _disturb(model, disturbance)
+    data = mujoco.MjData(model)  # From here on, what never moves is not looked at again.
     whole, gripper = load_arm(model, SITE), Gripper.of(model)
-    if start is not None:
-        data.qpos[whole.qpos] = start
-    mujoco.mj_forward(model, data)
-    rng = np.random.default_rng([0, *np.atleast_1d(seed)])
-    while start is None and _arm_touches(model, data):
-        data.qpos[whole.qpos] = rng.uniform(whole.lower, whole.upper)
-        mujoco.mj_forward(model, data)
-    data.ctrl[whole.actuators] = whole.servo[:, 0] * data.qpos[whole.qpos] + whole.servo[:, 1]
-    data.ctrl[gripper.actuators] = gripper.to_ctrl(data.qpos[gripper.qpos])
-    calibrated = Camera.from_mujoco(model, CAMERA, WIDTH, HEIGHT, data)
-    _move_camera(model, disturbance)
-    mujoco.mj_forward(model, data)
-    placed = tuple(
-        PlacedObject(
-            one.class_id, one.position, one.yaw, np.flatnonzero(model.geom_bodyid == model.body(f"object {i}").id)
-        )
-        for i, one in enumerate(layout.objects)
-    )
+    data.qpos[: len(layout.pose)] = layout.pose  # The arm's bodies come first.
+    _start(data, whole, gripper, start, np.random.default_rng(np.atleast_1d(seed)))
+    placed = placed_objects(model, layout.objects)
     positions = np.array([one.position for one in placed]).reshape(-1, 3)
     return TabletopScene(model, data, placed, whole, gripper, calibrated, placed_bins, positions)
+
+
+def _solid_arm(source: str | Path, friction: np.ndarray) -> mujoco.MjSpec:
+    """An arm that collides; refused if it has no gripper."""
+    arm = load_arm(source, SITE)
+    assert arm.mj_spec is not None  # It comes from a file.
+    spec = arm.mj_spec.copy()
+    _make_solid(spec.geoms, ARM_BIT, 0, friction)
+    for g in Gripper.of(arm.mj_model).geoms:
+        spec.geoms[g].condim = 4
+    return spec
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:
@@ -256,41 +214,35 @@ def _make_movable(body: mujoco.MjsBody, density: float, friction: np.ndarray) ->
         geom.condim = 6 if rolls else 4
 
 
-def _place_bins(spec: mujoco.MjSpec, names: Sequence[str], radius: float, friction: np.ndarray) -> dict[str, Bin]:
-    places = [(row, side * azimuth) for row, azimuth in BIN_AZIMUTHS for side in (1, -1)]
-    if len(names) > len(places):
-        raise UserError(f"{len(names)} bins: there is room for {len(places)}")
-    if len(set(names)) < len(names):
-        raise UserError(f"two bins of the same name: {', '.join(names)}")
-    bins = {}
-    for name, (row, azimuth) in zip(names, places, strict=False):
-        yaw = float(np.deg2rad(azimuth))
-        one = Bin(name, row * radius * np.array([np.cos(yaw), np.sin(yaw)]), yaw)
-        body = spec.worldbody.add_body(
-            name=f"bin {name}", pos=[*one.position, 0], quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
-        )
-        middle, rgba = BIN_HALF - BIN_WALL / 2, [0.55, 0.57, 0.6, 1]
-        box = mujoco.mjtGeom.mjGEOM_BOX
-        floor = BIN_HALF - BIN_WALL
-        body.add_geom(type=box, size=[floor, floor, 0.0015], rgba=rgba, contype=0, conaffinity=0)
-        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            size = [BIN_WALL / 2 if x else BIN_HALF, BIN_WALL / 2 if y else BIN_HALF, BIN_HEIGHT / 2]
-            wall = body.add_geom(type=box, size=size, pos=[x * middle, y * middle, BIN_HEIGHT / 2], rgba=rgba)
-            _make_solid([wall], 0, ARM_BIT | OBJECT_BIT, friction)
-        bins[name] = one
-    return bins
+def _start(data: mujoco.MjData, arm: Arm, gripper: Gripper, start: np.ndarray | None, rng: np.random.Generator) -> None:
+    """Put the arm where it starts, and tell its actuators to hold it there."""
+    model = data.model
+    if start is not None:
+        data.qpos[arm.qpos] = start
+    mujoco.mj_forward(model, data)
+    while start is None and (model.geom_contype[data.contact.geom] == ARM_BIT).any():
+        data.qpos[arm.qpos] = rng.uniform(arm.lower, arm.upper)
+        mujoco.mj_forward(model, data)
+    data.ctrl[arm.actuators] = arm.servo[:, 0] * data.qpos[arm.qpos] + arm.servo[:, 1]
+    data.ctrl[gripper.actuators] = gripper.to_ctrl(data.qpos[gripper.qpos])
 
 
-def _arm_touches(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
-    return bool((model.geom_contype[data.contact.geom] == ARM_BIT).any())
-
-
-def _move_camera(model: mujoco.MjModel, disturbance: Disturbance) -> None:
+def _disturb(model: mujoco.MjModel, disturbance: Disturbance) -> None:
+    """Change the light, and where the camera stands."""
+    head = model.vis.headlight
+    for light in (
+        model.light_ambient,
+        model.light_diffuse,
+        model.light_specular,
+        head.ambient,
+        head.diffuse,
+        head.specular,
+    ):
+        light *= disturbance.light
     camera = model.camera(CAMERA).id
     model.cam_pos[camera] += disturbance.camera_shift
     angle = float(np.linalg.norm(disturbance.camera_turn))
     if angle:
-        turn, turned = np.empty(4), np.empty(4)
+        turn, before = np.empty(4), model.cam_quat[camera].copy()
         mujoco.mju_axisAngle2Quat(turn, np.array(disturbance.camera_turn) / angle, angle)
-        mujoco.mju_mulQuat(turned, turn, model.cam_quat[camera])
-        model.cam_quat[camera] = turned
+        mujoco.mju_mulQuat(model.cam_quat[camera], turn, before)

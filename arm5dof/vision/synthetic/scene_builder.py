@@ -51,7 +51,8 @@ class SceneBuilder:
         self._add(self.spec.worldbody, Part(BOX, half, (u(-0.05, 0.2), u(-0.1, 0.1), -half[2])), table)
         floor, below = self._material(self._surface(), repeat=u(0.5, 4)), u(0.4, 0.9)
         plane = mujoco.mjtGeom.mjGEOM_PLANE
-        self.spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, -below], material=floor)
+        place = {"size": [6, 6, 0.1], "pos": [0, 0, -below]}
+        self.spec.worldbody.add_geom(type=plane, material=floor, contype=0, conaffinity=0, **place)
 
     def paper(self) -> None:
         """Add up to four pieces of paper lying flat, printed or of one color."""

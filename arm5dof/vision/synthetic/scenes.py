@@ -98,13 +98,16 @@ def random_scene(seed: int | tuple[int, ...], style: Style = "training") -> Scen
     data = mujoco.MjData(model)
     data.qpos[:] = layout.pose
     mujoco.mj_forward(model, data)
-    placed = (
-        PlacedObject(
-            one.class_id, one.position, one.yaw, np.flatnonzero(model.geom_bodyid == model.body(f"object {i}").id)
-        )
-        for i, one in enumerate(layout.objects)
+    return Scene(model, data, placed_objects(model, layout.objects))
+
+
+def placed_objects(model: mujoco.MjModel, placements: Sequence[Placement]) -> tuple[PlacedObject, ...]:
+    """The objects of a layout in the model that was compiled from it."""
+    bodies = [model.body(f"object {i}").id for i in range(len(placements))]
+    return tuple(
+        PlacedObject(one.class_id, one.position, one.yaw, np.flatnonzero(model.geom_bodyid == body))
+        for one, body in zip(placements, bodies, strict=True)
     )
-    return Scene(model, data, tuple(placed))
 
 
 def random_layout(
