@@ -39,6 +39,7 @@ def test_models_and_experiments_are_found_from_an_installed_wheel(wheel, tmp_pat
         "5",
         "arm5.xml",
         "arm7.xml",
+        "arm7_gripper.xml",
         "reach.xml",
     ]
 

@@ -57,8 +57,8 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = "e
         if not model.jnt_limited[j]:
             raise UserError(f'joint {name!r} has no limits: give it range="LOWER UPPER" in the MJCF')
 
-    actuators = np.array([_position_actuator(model, j) for j in ids])
-    servo = np.array([_servo(model, a) for a in actuators])
+    actuators = np.array([position_actuator(model, j) for j in ids])
+    servo = np.array([servo_line(model, a) for a in actuators])
     lower, upper = _limits(model, ids, actuators, servo)
     chain = _chain(model, path, site_id)
     slides = ids[model.jnt_type[ids] == SLIDE]
@@ -132,7 +132,7 @@ def _clean(constants: np.ndarray) -> np.ndarray:
     return np.where(np.abs(constants - nearest) < 1e-14, nearest, constants)
 
 
-def _position_actuator(model: mujoco.MjModel, joint: int) -> int:
+def position_actuator(model: mujoco.MjModel, joint: int) -> int:
     """Id of the actuator that servoes a joint's position, or -1."""
     for a in range(model.nu):
         on_joint = model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and model.actuator_trnid[a, 0] == joint
@@ -143,8 +143,9 @@ def _position_actuator(model: mujoco.MjModel, joint: int) -> int:
     return -1
 
 
-def _servo(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
-    """Slope and offset of the control at which gain * control + bias_0 + bias_1 * gear * q vanishes."""
+def servo_line(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
+    """Slope and offset of the control that holds a position actuator's joint at q: there gain * control + bias_0 +
+    bias_1 * gear * q vanishes."""
     if actuator < 0:
         return 1.0, 0.0
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]

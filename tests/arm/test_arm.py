@@ -269,7 +269,9 @@ def test_the_same_arm_without_the_fault_is_accepted(tmp_path: Path):
 
 
 def test_a_missing_file_names_those_there_are(tmp_path: Path):
-    with pytest.raises(UserError, match=r"no MJCF file 'absent\.xml'.*arm5\.xml, arm7\.xml, reach\.xml"):
+    with pytest.raises(
+        UserError, match=r"no MJCF file 'absent\.xml'.*arm5\.xml, arm7\.xml, arm7_gripper\.xml, reach\.xml"
+    ):
         load_arm("absent.xml")
     with pytest.raises(UserError, match="no MJCF file"):
         load_arm(tmp_path)

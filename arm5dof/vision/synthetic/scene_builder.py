@@ -17,20 +17,20 @@ class SceneBuilder:
     """Adds to a spec, at random. What is on a texture is filled in after compiling, which is quicker.
 
     Args:
-        spec: What it adds to.
+        spec: What it adds to; also its attribute.
         rng: The generator that everything comes from.
         family: The textures to choose from.
     """
 
     def __init__(self, spec: mujoco.MjSpec, rng: np.random.Generator, family: textures.Family) -> None:
         self.rng = rng
-        self._spec, self._family = spec, family
+        self.spec, self._family = spec, family
         self._images: dict[str, np.ndarray] = {}
         self._count = 0
 
     def compile(self) -> mujoco.MjModel:
         """The model, with everything that was added."""
-        model = self._spec.compile()
+        model = self.spec.compile()
         for name, image in self._images.items():
             first = model.tex_adr[model.texture(name).id]
             model.tex_data[first : first + image.size] = image.ravel()
@@ -38,7 +38,7 @@ class SceneBuilder:
 
     def paint_arm(self) -> None:
         """Sometimes give the arm other colors."""
-        for material in self._spec.materials:
+        for material in self.spec.materials:
             if self.rng.random() < 0.3:
                 material.rgba = [*textures.random_color(self.rng), 1]
             material.specular, material.shininess = self.rng.uniform(0, 0.6), self.rng.uniform(0.1, 0.9)
@@ -48,10 +48,11 @@ class SceneBuilder:
         u = self.rng.uniform
         half = (u(0.35, 0.8), u(0.35, 0.8), 0.015)
         table = self._material(self._surface(), repeat=u(1, 8))
-        self._add(self._spec.worldbody, Part(BOX, half, (u(-0.05, 0.2), u(-0.1, 0.1), -half[2])), table)
+        self._add(self.spec.worldbody, Part(BOX, half, (u(-0.05, 0.2), u(-0.1, 0.1), -half[2])), table)
         floor, below = self._material(self._surface(), repeat=u(0.5, 4)), u(0.4, 0.9)
         plane = mujoco.mjtGeom.mjGEOM_PLANE
-        self._spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, -below], material=floor)
+        place = {"size": [6, 6, 0.1], "pos": [0, 0, -below]}
+        self.spec.worldbody.add_geom(type=plane, material=floor, contype=0, conaffinity=0, **place)
 
     def paper(self) -> None:
         """Add up to four pieces of paper lying flat, printed or of one color."""
@@ -80,7 +81,7 @@ class SceneBuilder:
 
     def body(self, position: np.ndarray, yaw: float, parts: tuple[Part, ...], material: str, name: str = "") -> None:
         """Add parts of one material, at a position (3,), metres, and a yaw, radians, in the base frame."""
-        body = self._spec.worldbody.add_body(name=name, pos=position, quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+        body = self.spec.worldbody.add_body(name=name, pos=position, quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
         for part in parts:
             self._add(body, part, material)
 
@@ -88,7 +89,7 @@ class SceneBuilder:
         """Add one to three lamps of nearly white light above the table, or the tinted light of one or two distant
         windows."""
         u = self.rng.uniform
-        head = self._spec.visual.headlight
+        head = self.spec.visual.headlight
         head.ambient, head.diffuse, head.specular = (
             np.repeat(u(*range_), 3) for range_ in ((0.2, 0.4), (0, 0.35), (0, 0.2))
         )
@@ -96,7 +97,7 @@ class SceneBuilder:
         for lamp in range(count):
             up = _direction(u(-np.pi, np.pi), np.deg2rad(u(30, 80)))
             aim = np.array([*u(-0.1, 0.25, 2), 0.0])
-            light = self._spec.worldbody.add_light(pos=aim + u(0.8, 1.6) * up, dir=-up)
+            light = self.spec.worldbody.add_light(pos=aim + u(0.8, 1.6) * up, dir=-up)
             tint = np.clip(1 + self.rng.normal(0, 0.12 if distant else 0.05, 3), 0.5, 1.5)
             light.diffuse, light.specular = tint * u(0.4, 0.9) / np.sqrt(count), np.repeat(u(0, 0.5), 3)
             light.castshadow = bool(u() < (0.9 if lamp == 0 else 0.3))
@@ -113,7 +114,7 @@ class SceneBuilder:
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, np.stack([x, y, back], 1).ravel())
         position = np.array([0.12, 0.0, 0.01]) + self.rng.normal(0, 0.02, 3) + u(0.6, 0.9) * back
-        self._spec.worldbody.add_camera(name=name, pos=position, quat=quaternion, fovy=u(32, 42))
+        self.spec.worldbody.add_camera(name=name, pos=position, quat=quaternion, fovy=u(32, 42))
 
     def _add(self, body: mujoco.MjsBody, part: Part, material: str) -> None:
         size, place = [*part.size, *[0.0] * (3 - len(part.size))], {"pos": part.position, "quat": part.quaternion}
@@ -125,13 +126,13 @@ class SceneBuilder:
         """The name of a new material with a texture, a color, or both."""
         self._count += 1
         name = f"material {self._count}"
-        material = self._spec.add_material(name=name)
+        material = self.spec.add_material(name=name)
         material.rgba = [*(np.ones(3) if color is None else color), 1]
         material.specular, material.shininess = self.rng.uniform(0, 0.5), self.rng.uniform(0.1, 0.9)
         if texture is not None:
             self._images[name] = np.tile(texture(self.rng, TEXTURE_SIZE), (6 if cube else 1, 1, 1))
             kind = mujoco.mjtTexture.mjTEXTURE_CUBE if cube else mujoco.mjtTexture.mjTEXTURE_2D
-            added = self._spec.add_texture(name=name, type=kind, width=TEXTURE_SIZE, height=TEXTURE_SIZE, nchannel=3)
+            added = self.spec.add_texture(name=name, type=kind, width=TEXTURE_SIZE, height=TEXTURE_SIZE, nchannel=3)
             added.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
             roles = [""] * int(mujoco.mjtTextureRole.mjNTEXROLE)
             roles[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = name
