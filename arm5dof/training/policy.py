@@ -84,8 +84,8 @@ class Policy(struct.PyTreeNode, eq=False):
                 several, (n, 3).
             corrections: How often the policy is asked again for a goal shifted by the error it was seen to make
                 (closed-loop target correction). The best answer counts.
-            candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the policy's
-                preferred one first: with an axis (candidates,) after that of the goals. Some may be far off.
+            candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the
+                policy's preferred one first: with an axis (candidates,) after that of the goals. Some may be far off.
             inputs: The goal inputs by name: `target=...`, and for `reach_pose` `approach=...` (3,) or (n, 3), or
                 `quaternion=...` (4,) or (n, 4), w first.
 
@@ -136,7 +136,8 @@ class Policy(struct.PyTreeNode, eq=False):
 def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int, every: bool) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
     if every:
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), inverse_kinematics.candidates(env, policy, goals, corrections)[0])
+        answers, _ = inverse_kinematics.candidates(env, policy, goals, corrections)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), answers)
     return inverse_kinematics.solve(env, policy, goals, corrections)
 
 

@@ -1,0 +1,215 @@
+"""`Grasper`: see, decide, grasp, place. It knows of the table what its perception tells and what its robot feels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from arm5dof.errors import UserError
+from arm5dof.grasp.bins import HEIGHT as BIN_HEIGHT
+from arm5dof.grasp.bins import Bin
+from arm5dof.grasp.gripper import Gripper
+from arm5dof.grasp.perception import Perception, SeenObject
+from arm5dof.grasp.planner import Approach, Planner
+from arm5dof.grasp.robot import Robot
+from arm5dof.grasp.world import World
+from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
+
+Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "done"]
+"""Where an attempt ended. see: no object of the class was seen; locate: none could be located; reach: the policy has no
+answer; collide: every motion would hit something; grip: the fingers closed on nothing; lift: what they held was lost;
+identify: what they hold is not as wide as the class; place: no way to where it should go; done: as asked."""
+
+STAGES: tuple[Stage, ...] = get_args(Stage)
+
+CLEARANCE = 0.06
+"""From how far above a point is approached, and how high objects are lifted, metres."""
+SLACK = 0.008
+"""How much wider than an object the gripper opens, metres."""
+SQUEEZE = 0.02
+"""How much narrower than an object it is told to close, metres: what makes the grip firm."""
+SPEED = 1.5
+"""Of the fastest joint on the way, rad/s, and a third of it on the line to an object."""
+ATTEMPTS = 3
+"""From as many images."""
+DROP = 0.003
+"""Above where it will rest an object is let go, metres."""
+LEAST = 0.002
+"""An object between the fingers is at least so wide, metres."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a request."""
+
+    stage: Stage
+    """Where it ended."""
+    reason: str = ""
+    """In words, for people."""
+    attempts: int = 1
+    """How many images were taken."""
+    position: np.ndarray | None = field(default=None, repr=False)
+    """Where the object was thought to be, (3,), metres, base frame."""
+
+    @property
+    def success(self) -> bool:
+        """Whether it ended as asked."""
+        return self.stage == "done"
+
+
+class Grasper:
+    """A program that picks objects by their class.
+
+    Args:
+        robot: The arm, its gripper and its camera.
+        perception: What finds objects in its images.
+        planner: What finds motions.
+        rest: Where the arm waits, out of the camera's way, (dof,), radians.
+        bins: By name.
+        on_stage: Called with a few words whenever it begins something, such as for a video.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        perception: Perception,
+        planner: Planner,
+        rest: np.ndarray,
+        bins: Iterable[Bin] = (),
+        on_stage: Callable[[str], object] = lambda _: None,
+    ) -> None:
+        self.robot, self.perception, self.planner, self.rest = robot, perception, planner, rest
+        self.bins = {one.name: one for one in bins}
+        self._say = on_stage
+        self._objects: list[SeenObject] = []
+        self._widest = Gripper.of(planner.arm.mj_model).limits[1]
+
+    def look(self) -> list[SeenObject]:
+        """What is seen now."""
+        self._say("look")
+        return self.perception(self.robot.image())
+
+    def pick(self, name: str) -> Outcome:
+        """Pick up an object of a class and hold it, `CLEARANCE` above where it was.
+
+        Args:
+            name: Of the class.
+
+        Returns:
+            What came of it. Unless it is `done` the arm is at rest and the gripper empty.
+
+        Raises:
+            UserError: There is no such class.
+        """
+        if name not in CLASS_NAMES:
+            raise UserError(f"no class {name!r}: the detector knows {', '.join(CLASS_NAMES)}")
+        outcome = Outcome("see")
+        for attempt in range(1, ATTEMPTS + 1):
+            outcome = self._attempt(name, attempt)
+            if outcome.success or outcome.stage in ("see", "locate", "reach"):
+                break  # Another image of the same table would show the same.
+        return outcome
+
+    def place(self, point: np.ndarray | None = None, bin: str | None = None) -> Outcome:
+        """Put down what was picked up, and go to rest.
+
+        Args:
+            point: Where on the table, (2,), metres, base frame.
+            bin: Or the name of a bin.
+
+        Returns:
+            What came of it. Unless it is `done` the arm still holds the object.
+
+        Raises:
+            UserError: There is no such bin, or not one of the two was given.
+        """
+        if (point is None) == (bin is None):
+            raise UserError("place takes a point or the name of a bin")
+        if bin is not None and bin not in self.bins:
+            raise UserError(f"no bin {bin!r}: there are {', '.join(self.bins) or 'none'}")
+        where = self.bins[bin].position if bin is not None else np.asarray(point, float)
+        height = self._held.half_height + (BIN_HEIGHT if bin is not None else DROP)
+        self._say(f"place at {1e3 * where[0]:.0f} {1e3 * where[1]:.0f} mm")
+        opening = self.robot.opening()
+        way = self._approach(np.append(where, height), opening)
+        if isinstance(way, str):
+            return Outcome("place", f"the place is {way}")
+        self._go(way)
+        if self.robot.opening() < LEAST:
+            return self._give_up("lift", "the object was lost on the way", way)
+        self.robot.grip(opening + SLACK)
+        self._retreat(way)
+        self._go_to_rest()
+        return Outcome("done")
+
+    def _attempt(self, name: str, attempt: int) -> Outcome:
+        seen = self.look()
+        wanted = [one for one in seen if one.name == name]
+        self._objects = [one for one in seen if one.position is not None]
+        located = [one for one in wanted if one.position is not None]
+        if not wanted:
+            return Outcome("see", f"no {name} is seen", attempt)
+        if not located:
+            return Outcome("locate", f"a {name} is seen, but {wanted[0].failure}", attempt)
+        kind = self._held = next(one for one in CATALOGUE if one.name == name)
+        outcome = Outcome("reach")
+        for target in located:
+            assert target.position is not None
+            self._say(f"plan: {name} at {1e3 * target.position[0]:.0f} {1e3 * target.position[1]:.0f} mm")
+            opening = min(2 * kind.radius + SLACK, self._widest)
+            way = self._approach(target.position, opening, target)
+            if not isinstance(way, str):
+                return self._grasp(way, target, opening, attempt)
+            stage: Stage = "reach" if way == "out of reach" else "collide"
+            outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, target.position)
+        return outcome
+
+    def _approach(self, point: np.ndarray, opening: float, target: SeenObject | None = None) -> Approach | str:
+        world = World(self.planner.arm, self.bins.values(), self._objects)
+        without = None if target is None else self._objects.index(target)
+        return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without)
+
+    def _grasp(self, way: Approach, target: SeenObject, opening: float, attempt: int) -> Outcome:
+        self._say(f"grasp the {target.name}")
+        self.robot.grip(opening)
+        self._go(way)
+        self.robot.grip(-SQUEEZE)
+        if self.robot.opening() < LEAST:
+            return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
+        self._say("lift")
+        self._retreat(way)
+        if self.robot.opening() < LEAST:
+            return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
+        self._objects = [one for one in self._objects if one is not target]
+        return Outcome("done", attempts=attempt, position=target.position)
+
+    def _give_up(
+        self, stage: Stage, reason: str, way: Approach, attempt: int = 1, target: SeenObject | None = None
+    ) -> Outcome:
+        self._say(f"give up: {reason}")
+        self.robot.grip(self._widest / 2)
+        if np.abs(self.robot.joints() - way.line[-1]).max() < np.abs(self.robot.joints() - way.line[0]).max():
+            self._retreat(way)
+        self._go_to_rest()
+        return Outcome(stage, reason, attempt, None if target is None else target.position)
+
+    def _go(self, way: Approach) -> None:
+        self._follow(way.transit[1:], SPEED)
+        self._follow(way.line[1:], SPEED / 3)
+
+    def _retreat(self, way: Approach) -> None:
+        self._follow(way.line[-2::-1], SPEED / 3)
+
+    def _go_to_rest(self) -> None:
+        self._say("rest")
+        world = World(self.planner.arm, self.bins.values(), self._objects)
+        path = self.planner.transit(world, self.robot.joints(), self.rest, self.robot.opening())
+        self._follow(np.stack([self.rest]) if path is None else path[1:], SPEED)
+
+    def _follow(self, path: np.ndarray, speed: float) -> None:
+        before = np.concatenate([[self.robot.joints()], path[:-1]])
+        seconds = np.maximum(np.abs(path - before).max(1) / speed, 0.02)
+        self.robot.move(np.cumsum(seconds), path)

@@ -1,0 +1,73 @@
+"""What a grasping program knows of the table: objects by class, where they are, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from arm5dof.errors import UserError
+from arm5dof.vision.camera import Camera
+from arm5dof.vision.detections import Detector
+from arm5dof.vision.localization import locate
+from arm5dof.vision.localization.solids import Solid
+from arm5dof.vision.objects import CATALOGUE
+
+
+@dataclass(frozen=True, eq=False)
+class SeenObject:
+    """An object that was seen."""
+
+    name: str
+    """Of its class."""
+    confidence: float
+    """Of the detector, in [0, 1]."""
+    position: np.ndarray | None
+    """Of its center in the base frame, (3,), metres; None if it could not be located."""
+    std: float
+    """The largest standard deviation of the position in any direction, metres; NaN without one."""
+    failure: str = ""
+    """Why it has no position."""
+
+
+Perception = Callable[[np.ndarray], list[SeenObject]]
+"""From an RGB image (h, w, 3) uint8 to what is seen in it, the surest first."""
+
+
+class CameraPerception:
+    """A detector, and a calibrated camera whose place is known; objects stand on the table.
+
+    Args:
+        detector: What finds objects.
+        camera: What takes the images, with extrinsics.
+        box_std: Standard deviation of the edges of the detector's boxes, pixels.
+
+    Raises:
+        UserError: The camera has no extrinsics.
+    """
+
+    def __init__(self, detector: Detector, camera: Camera, box_std: float = 1.0) -> None:
+        if not camera.has_extrinsics:
+            raise UserError("the camera has no extrinsics: find its pose first (arm5dof.vision.calibration)")
+        self.detector, self.camera, self.box_std = detector, camera, box_std
+        self._solids = {one.name: Solid(one.half_height, form=one.form) for one in CATALOGUE}
+
+    def __call__(self, image: np.ndarray) -> list[SeenObject]:
+        """See `Perception`. Raises `UserError` for an image of another size than the camera's."""
+        if image.shape[:2] != (self.camera.height, self.camera.width):
+            size, wanted = f"{image.shape[1]} x {image.shape[0]}", f"{self.camera.width} x {self.camera.height}"
+            raise UserError(f"the image is {size}, the camera was calibrated for {wanted}: give one of its own")
+        detections = self.detector(image)
+        found = locate(detections, self.camera, self._solids, box_std=self.box_std)
+        names = detections.data["class_name"]
+        return [
+            SeenObject(
+                str(names[i]),
+                float(detections.confidence[i]),
+                None if failure else found.position[i],
+                float("nan") if failure else float(np.sqrt(np.linalg.eigvalsh(found.covariance[i])[-1])),
+                failure,
+            )
+            for i, failure in enumerate(found.failure)
+        ]

@@ -1,0 +1,121 @@
+"""`World`: a planner's model of the arm and what is known to stand around it, in which motions are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+
+from arm5dof.arm import Arm
+from arm5dof.errors import UserError
+from arm5dof.grasp.bins import Bin
+from arm5dof.grasp.gripper import Gripper
+from arm5dof.grasp.perception import SeenObject
+from arm5dof.vision.camera import Camera
+from arm5dof.vision.objects import CATALOGUE
+
+STEP = 0.04
+"""How finely motions are checked: the largest turn of a joint between one pose and the next, radians."""
+ALLOWED = 0.003
+"""How deep a motion may cut into what is known, metres: objects count as upright cylinders, wider than they are."""
+REST_POSES = 400
+"""Among so many random poses the one is taken that hides least from the camera."""
+ROOM = (0.08, 0.28)
+"""Where the camera should see the table: distances from the arm's axis, metres."""
+ARM, OTHERS = 1, 2
+
+
+class World:
+    """The arm, the table, bins, and objects as upright cylinders.
+
+    Args:
+        arm: The arm, from a file, with a gripper.
+        bins: What stands on the table.
+        objects: What was seen there, with positions.
+    """
+
+    def __init__(self, arm: Arm, bins: Iterable[Bin] = (), objects: Sequence[SeenObject] = ()) -> None:
+        if arm.mj_spec is None:
+            raise UserError("the planner needs the arm's MJCF file, not its compiled model alone")
+        spec = arm.mj_spec.copy()
+        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity, geom.margin, geom.gap = ARM, 0, 0, 0
+        around = [spec.worldbody.add_geom(name="known table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1])]
+        for one in bins:
+            around += one.add_to(spec)
+        radius = {one.name: one.radius for one in CATALOGUE}
+        height = {one.name: one.half_height for one in CATALOGUE}
+        for i, seen in enumerate(objects):
+            assert seen.position is not None
+            size = [radius[seen.name], height[seen.name], 0]
+            kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+            around.append(spec.worldbody.add_geom(name=f"known object {i}", type=kind, size=size, pos=seen.position))
+        for geom in around:
+            geom.contype, geom.conaffinity = 0, ARM
+        self.model = spec.compile()
+        self.arm, self.gripper = arm, Gripper.of(self.model)
+        self._objects = [self.model.geom(f"known object {i}").id for i in range(len(objects))]
+        self._data = mujoco.MjData(self.model)
+        # What of the arm stands on the table for good touches it in every pose.
+        fixed = self.model.body_weldid[self.model.geom_bodyid] == 0
+        self.model.geom_contype[fixed] = 0
+
+    def clear(self, path: np.ndarray, opening: float, without: int | None = None) -> bool:
+        """Whether the arm hits nothing on a path.
+
+        Args:
+            path: Joint positions (k, dof), radians, between which joints move in straight lines.
+            opening: Of the gripper, metres.
+            without: Number of an object that may be touched.
+        """
+        return all(self._clear(q, opening, without) for q in dense(path))
+
+    def rest(self, camera: Camera, opening: float = 0.0) -> np.ndarray:
+        """A pose out of the camera's way, (dof,), radians: of random poses that hit nothing the one that hides least of
+        the table where objects are, and among those the one nearest the middle of the joints' ranges. The same for the
+        same arm and camera."""
+        rng = np.random.default_rng(0)
+        origin = np.asarray(camera.position, float)
+        radius, azimuth = np.meshgrid(np.linspace(*ROOM, 5), np.deg2rad(np.linspace(-110, 110, 23)))
+        points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full_like(radius, 0.02)], -1)
+        ways = (points.reshape(-1, 3) - origin) / np.linalg.norm(points.reshape(-1, 3) - origin, axis=1)[:, None]
+        best, least = self.arm.home, (np.inf, np.inf)
+        for _ in range(REST_POSES):
+            q = rng.uniform(self.arm.lower, self.arm.upper)
+            if not self._clear(q, opening, None):
+                continue
+            mujoco.mj_forward(self.model, self._data)
+            hidden = sum(self._hides(origin, way) for way in ways)
+            middle = float(np.abs(2 * (q - self.arm.lower) / (self.arm.upper - self.arm.lower) - 1).max())
+            if (hidden, middle) < least:
+                best, least = q, (hidden, middle)
+        return best
+
+    def _hides(self, origin: np.ndarray, way: np.ndarray) -> bool:
+        geom = np.full(1, -1, np.int32)
+        mujoco.mj_ray(self.model, self._data, origin, way, None, 1, -1, geom)
+        return geom[0] >= 0 and self.model.geom_contype[geom[0]] == ARM
+
+    def _clear(self, q: np.ndarray, opening: float, without: int | None) -> bool:
+        data = self._data
+        data.qpos[self.arm.qpos] = q
+        data.qpos[self.gripper.qpos] = self.gripper.fingers(opening)
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_collision(self.model, data)
+        deep = data.contact.dist < -ALLOWED
+        if without is not None:
+            deep &= ~(data.contact.geom == self._objects[without]).any(1)
+        return not deep.any()
+
+
+def dense(path: np.ndarray) -> np.ndarray:
+    """A path (k, dof) with poses between, no joint moving more than `STEP` from one to the next."""
+    pieces = [path[:1]]
+    for start, end in pairwise(path):
+        count = max(1, int(np.ceil(np.abs(end - start).max() / STEP)))
+        pieces.append(start + (end - start) * np.arange(1, count + 1)[:, None] / count)
+    return np.concatenate(pieces)
