@@ -23,7 +23,8 @@ enough from those for a finger to pass between."""
 HALF, WALL, HEIGHT = 0.035, 0.002, 0.02
 """Half the outer width, thickness and height of the walls, metres: the longest object fits in whichever way it is
 turned, and a gripper that holds its center 20 mm above where it will lie opens above the walls."""
-GREY = (0.55, 0.57, 0.6, 1.0)
+COLOR = (0.1, 0.1, 0.11, 1.0)
+"""Nearly black: the walls of a lighter bin are easily taken for bricks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +48,13 @@ class Bin:
         quaternion = [np.cos(self.yaw / 2), 0, 0, np.sin(self.yaw / 2)]
         body = spec.worldbody.add_body(name=f"bin {self.name}", pos=[*self.position, 0], quat=quaternion)
         box, middle, inner = mujoco.mjtGeom.mjGEOM_BOX, HALF - WALL / 2, HALF - WALL
-        body.add_geom(type=box, size=[inner, inner, 0.0015], rgba=GREY, contype=0, conaffinity=0)
+        body.add_geom(type=box, size=[inner, inner, 0.0015], rgba=COLOR, contype=0, conaffinity=0)
         return [
             body.add_geom(
                 type=box,
                 size=[WALL / 2 if x else HALF, WALL / 2 if y else HALF, HEIGHT / 2],
                 pos=[x * middle, y * middle, HEIGHT / 2],
-                rgba=GREY,
+                rgba=COLOR,
             )
             for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
         ]
