@@ -109,10 +109,14 @@ class Run:
     @cached_property
     def env(self) -> Task:
         """The environment, with the robot that the run was made for, whatever happened to its MJCF since."""
-        with _undamaged(self.folder / "run.json"):
-            record = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))
+        path = self.folder / "run.json"
+        with _undamaged(path):
+            record = json.loads(path.read_text(encoding="utf-8"))
             version, digests = str(record["versions"]["mujoco"]), dict(record["model"])
-        return make_env(self.config, robot.kept(self.folder, version, digests))
+        env = make_env(self.config, robot.kept(self.folder, version, digests))
+        if env.mj_model is not None and not digests:
+            raise UserError(f"{path} is damaged (it names no robot): take it from a copy of the run")
+        return env
 
     def trainer(self) -> Trainer:
         """The run's training program."""

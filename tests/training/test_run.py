@@ -255,6 +255,29 @@ def test_damaged_metrics_are_refused(runs: dict[str, Path], elsewhere: Path):
         assert "metrics.csv is damaged" in said(call)
 
 
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_run_that_names_no_robot_does_not_fall_back_to_the_arms_own_file(
+    runs: dict[str, Path], elsewhere: Path, gone: bool
+):
+    """`elsewhere` has another arm in a file of the name that the run's settings give."""
+    folder = copy(runs["finished"], elsewhere / "run")
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**record, "model": {}}))
+    if gone:
+        for name in record["model"]:
+            (folder / name).unlink()
+    for call in (Run.open(folder).policy, lambda: resume(Run.open(folder)), lambda: Run.open(folder).env):
+        assert said(call).endswith("run.json is damaged (it names no robot): take it from a copy of the run")
+
+
+def test_a_record_without_the_compiled_robot_is_refused(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["finished"], elsewhere / "run")
+    record = json.loads((folder / "run.json").read_text())
+    del record["model"]["model.mjb.gz"]
+    (folder / "run.json").write_text(json.dumps(record))
+    assert "model.mjb.gz, the run's robot, is missing or damaged" in said(Run.open(folder).policy)
+
+
 def of_another_version(folder: Path) -> dict:
     """What a run says that was made with another MuJoCo."""
     record = json.loads((folder / "run.json").read_text())
