@@ -38,9 +38,7 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
     return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
 
 
-def _follow(
-    env: ForwardModel, act: Act, goals: Goal, branch: jax.Array, corrections: int
-) -> tuple[Answer, jax.Array]:
+def _follow(env: ForwardModel, act: Act, goals: Goal, branch: jax.Array, corrections: int) -> tuple[Answer, jax.Array]:
     """The best answers of given branches (n,), and their rewards (n,)."""
     observe = jax.vmap(env.question)
 

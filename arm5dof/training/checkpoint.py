@@ -13,7 +13,7 @@ import hashlib
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -33,7 +33,8 @@ class Checkpoints:
     """The checkpoints of one run, in one folder, numbered by the steps taken.
 
     `settings` are those that shape what is kept, by name: a checkpoint made with others is refused. Those of `budget`
-    may change, and `check` says which did. Only the process that trains the run may open them for writing: it clears
+    may change, and `check` says which did. One of `left_open` that a record lacks is not compared: it
+    is younger than the run. Only the process that trains the run may open them for writing: it clears
     away what a killed one left unfinished.
     """
 
@@ -43,10 +44,12 @@ class Checkpoints:
         settings: Mapping[str, Any],
         budget: Mapping[str, Any] | None = None,
         read_only: bool = False,
+        left_open: Collection[str] = (),
     ) -> None:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
         self.folder = folder
+        self._left_open = left_open
         # As a record gives them back: JSON has no tuples.
         self._settings, self._budget = json.loads(json.dumps([dict(settings), dict(budget or {})]))
         logging.getLogger("absl").setLevel(logging.CRITICAL)
@@ -132,7 +135,7 @@ class Checkpoints:
             made_with = record.get("settings")
         if made_with is None:
             raise UserError(f"the checkpoint {where} is of an older version: train the run anew")
-        names = [*made_with, *(name for name in self._settings if name not in made_with)]
+        names = [*made_with, *(name for name in self._settings if name not in {*made_with, *self._left_open})]
         if changed := [name for name in names if made_with.get(name) != self._settings.get(name)]:
             told = "; ".join(f"{n} = {made_with.get(n)!r}, now {self._settings.get(n)!r}" for n in changed[:3])
             raise UserError(

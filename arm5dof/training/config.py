@@ -111,23 +111,25 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
         names = ", ".join(files.shipped("experiments", ".toml"))
         raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
     values = _read(path)
-    config = build(values, str(path), path.parent)  # A fault of the file is not to be blamed on the overrides.
+    # A fault of the file is not to be blamed on the overrides.
+    config = build(values, str(path), path.parent, fill=True)
     if not overrides:
         return config
     known = fields(config.task)
     for name, value in overrides.items():
         found = find(name, known)
         values.setdefault(found.section, {})[found.name] = _parse(value, found.default)
-    return build(values, "", path.parent)
+    return build(values, "", path.parent, fill=True)
 
 
-def build(values: Mapping[str, Any], source: str = "", folder: Path | None = None) -> Config:
+def build(values: Mapping[str, Any], source: str = "", folder: Path | None = None, fill: bool = False) -> Config:
     """A configuration from nested settings, as TOML has them.
 
     Args:
         values: Settings by section and name; `values["env"]["task"]` is the task.
         source: Where they are from, for errors.
         folder: Where a user's own task may be imported from, besides the usual places.
+        fill: Take what they leave open from the TOML file of a task that ships, rather than from the sections' classes.
 
     Raises:
         UserError: The first fault, and for an unknown key the nearest valid one.
@@ -140,7 +142,8 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
                 raise UserError(f"{section} = {given!r}: it should be a section [{section}]")
         task = values.get("env", {}).get("task", "reach")
         classes = section_classes(task, folder)
-        merged = {section: {**_task_defaults(task).get(section, {}), **values.get(section, {})} for section in SECTIONS}
+        shipped = _task_defaults(task) if fill else {}
+        merged = {section: {**shipped.get(section, {}), **values.get(section, {})} for section in SECTIONS}
         merged["env"].pop("task", None)
         return Config(task, **{name: _section(name, classes[name], merged[name]) for name in SECTIONS})
     except UserError as error:
@@ -213,7 +216,7 @@ def make_env(config: Config, mj_model: mujoco.MjModel | None = None) -> Task:
 
 def fields(task: str = "reach", folder: Path | None = None) -> list[Field]:
     """Every setting with its documentation, in the order of declaration; defaults are the task's."""
-    defaults = build({"env": {"task": task}}, folder=folder)
+    defaults = build({"env": {"task": task}}, folder=folder, fill=True)
     return [
         Field(section, name, getattr(getattr(defaults, section), name), *described)
         for section, cls in section_classes(task, folder).items()

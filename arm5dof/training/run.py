@@ -68,6 +68,8 @@ class Run:
 
     folder: Path
     config: Config
+    left_open: frozenset[str] = frozenset()
+    """Full names of settings that its `config.toml` leaves open: those that came with a later version."""
 
     @staticmethod
     def create(settings: Config, folder: str | Path, env: Task | None = None) -> Run:
@@ -93,7 +95,11 @@ class Run:
 
     @staticmethod
     def open(folder: str | Path) -> Run:
-        """A run that exists. Raises `UserError` if the folder is none, or its task cannot be imported."""
+        """A run that exists. What its `config.toml` leaves open is as the settings' classes have it.
+
+        Raises:
+            UserError: The folder is no run, or its task cannot be imported.
+        """
         folder = Path(folder)
         path = folder / "config.toml"
         if not path.is_file() or not (folder / "run.json").is_file():
@@ -104,7 +110,9 @@ class Run:
             values = tomllib.loads(path.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"{path} is not valid TOML: {error}") from None
-        return Run(folder, config.build(values, str(path)))
+        settings = config.build(values, str(path))
+        stated = {f"{section}.{name}" for section, given in values.items() for name in given}
+        return Run(folder, settings, frozenset(settings.flat().keys() - stated))
 
     @cached_property
     def env(self) -> Task:
@@ -152,7 +160,7 @@ class Run:
 
     def _checkpoints(self, read_only: bool = False) -> Checkpoints:
         fixed, budget = config.fixed(self.config), config.may_change(self.config)
-        return Checkpoints(self.folder / "checkpoints", fixed, budget, read_only)
+        return Checkpoints(self.folder / "checkpoints", fixed, budget, read_only, self.left_open)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
