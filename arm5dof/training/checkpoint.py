@@ -33,9 +33,9 @@ class Checkpoints:
     """The checkpoints of one run, in one folder, numbered by the steps taken.
 
     `settings` are those that shape what is kept, by name: a checkpoint made with others is refused. Those of `budget`
-    may change, and `check` says which did. One of `left_open` that a record lacks is not compared: it
-    is younger than the run. Only the process that trains the run may open them for writing: it clears
-    away what a killed one left unfinished.
+    may change, and `check` says which did. One of `left_open` that a record lacks is not compared: it is younger than
+    the run. Only the process that trains the run may open them for writing: it clears away what a killed one left
+    unfinished.
     """
 
     def __init__(
@@ -98,9 +98,9 @@ class Checkpoints:
     def check(self) -> dict[str, tuple[Any, Any]]:
         """Raise `UserError` if the newest checkpoint, where there is one, was made with other settings or is damaged.
         Returns what of the budget has changed since: from what to what, by name."""
-        before = {} if self.latest is None else self._record(self.latest).get("budget", {})
-        now = self._budget
-        return {name: (before[name], now[name]) for name in before if name in now and before[name] != now[name]}
+        record = {} if self.latest is None else self._record(self.latest)
+        before = {**record.get("settings", {}), **record.get("budget", {})}
+        return {name: (before[name], v) for name, v in self._budget.items() if name in before and before[name] != v}
 
     def _read(self, item: str, like: T) -> T:
         import orbax.checkpoint as ocp
@@ -136,7 +136,8 @@ class Checkpoints:
         if made_with is None:
             raise UserError(f"the checkpoint {where} is of an older version: train the run anew")
         names = [*made_with, *(name for name in self._settings if name not in {*made_with, *self._left_open})]
-        if changed := [name for name in names if made_with.get(name) != self._settings.get(name)]:
+        fixed = [name for name in names if name not in self._budget]
+        if changed := [name for name in fixed if made_with.get(name) != self._settings.get(name)]:
             told = "; ".join(f"{n} = {made_with.get(n)!r}, now {self._settings.get(n)!r}" for n in changed[:3])
             raise UserError(
                 f"the checkpoint {where} was made with other settings ({told}): set them back in config.toml"

@@ -227,6 +227,16 @@ def test_a_setting_that_only_one_of_configuration_and_checkpoint_has_is_compared
     assert f"({name} = None, now 0.5)" in said(Run.open(folder).policy)
 
 
+def test_a_setting_of_which_an_older_version_did_not_know_that_it_may_change(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["half"], elsewhere / "half")
+    for path in folder.glob("checkpoints/*/record/metadata"):
+        kept = json.loads(path.read_text())
+        kept["settings"]["env.branches"] = kept["budget"].pop("env.branches")
+        path.write_text(json.dumps(kept))
+    assert Run.open(folder).policy().solve(GOALS).q.shape == (3, 5)
+    assert edit(folder, **{"env.branches": 2})._checkpoints(read_only=True).check() == {"env.branches": (1, 2)}
+
+
 def test_a_run_does_not_change_with_the_tasks_toml(tmp_path: Path):
     """What a run's config.toml lacks is as the classes have it, whatever the TOML file says today."""
     shipped = load_config("reach_pose.toml")
