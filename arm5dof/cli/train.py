@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
-    from arm5dof.training.config import Config, Field
+    from arm5dof.training.config import Config
 
 HELP = """\
 Train a policy.
@@ -106,25 +106,18 @@ def _configure(experiment: str, texts: dict[str, str], smoke: bool) -> Config:
     """The configuration that a command line asks for."""
     from arm5dof.training import config
 
-    fields = config.fields(config.load_config(experiment).task)
-    given = {_setting(name, fields).name for name in texts}
-    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
+    found = config.load_config(experiment)
+    fields = config.fields(found)
+    try:
+        given = {config.find(name, fields).name for name in texts}
+    except config.UnknownSettingError as error:
+        hint = f"did you mean --{error.nearest.replace('_', '-')}?" if error.nearest else "see arm5dof train --help"
+        raise UserError(f"unknown option --{error.name}: {hint}") from None
     for name, value in texts.items():
         if not value:
             raise UserError(f"--{name} needs a value")
-    return config.load_config(experiment, **short, **texts)
-
-
-def _setting(name: str, fields: list[Field]) -> Field:
-    """The setting of that name, with options in what is said of a name that is none."""
-    from arm5dof.training import config
-
-    near = config.nearest(name.replace("-", "_"), [key for f in fields for key in (f.name, f"{f.section}.{f.name}")])
-    known = [f for f in fields if name.replace("-", "_") in (f.name, f"{f.section}.{f.name}")]
-    if not known:
-        hint = f"did you mean --{near.replace('_', '-')}?" if near else "see arm5dof train --help"
-        raise UserError(f"unknown option --{name}: {hint}")
-    return config.find(name, fields)
+    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
+    return config.override(found, {**short, **texts})
 
 
 def _experiment_and_settings(rest: list[str]) -> tuple[str | None, dict[str, str]]:
@@ -151,11 +144,11 @@ def _print_help(parser: argparse.ArgumentParser, experiment: str) -> None:
     from arm5dof.training import config
 
     section = None
-    for f in config.fields(config.load_config(experiment).task):
+    for f in config.fields(config.load_config(experiment)):
         if f.section != section:
             section = f.section
             group = parser.add_argument_group(f"settings [{section}]")
         choices = f" One of {', '.join(f.choices)}." if f.choices else ""
-        text = f"{f.help}{choices} (default {f.default})"
+        text = f"{f.help}{choices} (default {f.value})"
         group.add_argument(f"--{f.name.replace('_', '-')}", metavar="VALUE", help=text.replace("%", "%%"))
     parser.print_help()

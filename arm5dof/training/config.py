@@ -80,7 +80,7 @@ class Field(NamedTuple):
 
     section: str
     name: str
-    default: Any
+    value: Any
     help: str
     choices: list[str] | None
 
@@ -104,22 +104,24 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     (100, 'kinematic')
     >>> load_config(batch_sise=3)
     Traceback (most recent call last):
-    arm5dof.errors.UserError: unknown setting 'batch_sise': did you mean 'batch_size'?
+    arm5dof.training.config.UnknownSettingError: unknown setting 'batch_sise': did you mean 'batch_size'?
     """
     path = files.find("experiments", experiment)
     if path is None:
         names = ", ".join(files.shipped("experiments", ".toml"))
         raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
-    values = _read(path)
-    # A fault of the file is not to be blamed on the overrides.
-    config = build(values, str(path), path.parent, fill=True)
-    if not overrides:
-        return config
-    known = fields(config.task)
-    for name, value in overrides.items():
+    return override(build(_read(path), str(path), path.parent, fill=True), overrides)
+
+
+def override(config: Config, values: Mapping[str, Any]) -> Config:
+    """A configuration with other values of some settings, by name, as `load_config` takes them."""
+    known, given = fields(config), dict[str, dict[str, Any]]()
+    for name, value in values.items():
         found = find(name, known)
-        values.setdefault(found.section, {})[found.name] = _parse(value, found.default)
-    return build(values, "", path.parent, fill=True)
+        given.setdefault(found.section, {})[found.name] = _parse(value, found.value)
+    now = {section: getattr(config, section) for section in given}
+    changed = {name: _section(name, type(now[name]), {**vars(now[name]), **given[name]}) for name in given}
+    return dataclasses.replace(config, **changed)
 
 
 def build(values: Mapping[str, Any], source: str = "", folder: Path | None = None, fill: bool = False) -> Config:
@@ -137,11 +139,12 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
     try:
         for section, given in values.items():
             if section not in SECTIONS:
-                raise UserError(f"unknown section {section!r}: {nearest_hint(section, SECTIONS)}")
+                raise UserError(f"unknown section {section!r}: {_hint(section, SECTIONS)}")
             if not isinstance(given, Mapping):
                 raise UserError(f"{section} = {given!r}: it should be a section [{section}]")
         task = values.get("env", {}).get("task", "reach")
-        classes = section_classes(task, folder)
+        classes = {"env": task_class(task, folder).Config, "ddpg": DDPGConfig, "train": TrainConfig}
+        classes["evaluate"] = EvaluateConfig
         shipped = _task_defaults(task) if fill else {}
         merged = {section: {**shipped.get(section, {}), **values.get(section, {})} for section in SECTIONS}
         merged["env"].pop("task", None)
@@ -154,12 +157,6 @@ def dumps(config: Config) -> str:
     """The configuration as TOML, every field spelled out."""
     sections = {name: dataclasses.asdict(getattr(config, name)) for name in SECTIONS}
     return tomli_w.dumps({**sections, "env": {"task": config.task, **sections["env"]}})
-
-
-def section_classes(task: str, folder: Path | None = None) -> dict[str, type]:
-    """The classes of a configuration's sections."""
-    own = task_class(task, folder).Config
-    return {"env": own, "ddpg": DDPGConfig, "train": TrainConfig, "evaluate": EvaluateConfig}
 
 
 def task_class(task: str, folder: Path | None = None) -> type[Task]:
@@ -214,34 +211,46 @@ def make_env(config: Config, mj_model: mujoco.MjModel | None = None) -> Task:
     return cls(config.env) if mj_model is None else cls(config.env, mj_model)
 
 
-def fields(task: str = "reach", folder: Path | None = None) -> list[Field]:
-    """Every setting with its documentation, in the order of declaration; defaults are the task's."""
-    defaults = build({"env": {"task": task}}, folder=folder, fill=True)
+def fields(config: Config) -> list[Field]:
+    """Every setting of a configuration with its documentation, in the order of declaration."""
     return [
-        Field(section, name, getattr(getattr(defaults, section), name), *described)
-        for section, cls in section_classes(task, folder).items()
-        for name, described in _descriptions(cls).items()
+        Field(section, name, getattr(settings, name), *described)
+        for section, settings in ((section, getattr(config, section)) for section in SECTIONS)
+        for name, described in _descriptions(settings.__class__).items()
     ]
 
 
 def find(name: str, known: list[Field]) -> Field:
-    """The setting of a name, `batch_size` or `ddpg.batch_size`. Raises `UserError` naming the nearest one if there is
-    none, or the full names if there are several."""
+    """The setting of a name, `batch_size` or `ddpg.batch_size`.
+
+    Raises:
+        UnknownSettingError: There is none.
+        UserError: There are several: it gives their full names.
+    """
     wanted = name.replace("-", "_")
     matching = [f for f in known if wanted in (f.name, f"{f.section}.{f.name}")]
     if len(matching) > 1:
         raise UserError(f"{name!r} is {' or '.join(f'{f.section}.{f.name}' for f in matching)}: name the section too")
     if not matching:
         names = [key for f in known for key in (f.name, f"{f.section}.{f.name}")]
-        raise UserError(f"unknown setting {name!r}: {nearest_hint(wanted, names, 'see arm5dof train --help')}")
+        raise UnknownSettingError(name, _nearest(wanted, names))
     return matching[0]
+
+
+class UnknownSettingError(UserError):
+    """No setting has that name; `nearest` is the valid one that is most like it, if any is."""
+
+    def __init__(self, name: str, nearest: str | None) -> None:
+        hint = f"did you mean {nearest!r}?" if nearest else "`Config.flat()` lists the valid ones"
+        super().__init__(f"unknown setting {name!r}: {hint}")
+        self.name, self.nearest = name, nearest
 
 
 def _section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
     names = [f.name for f in dataclasses.fields(cls)]
     for key in values:
         if key not in names:
-            raise UserError(f"unknown key '{name}.{key}': {nearest_hint(key, names)}")
+            raise UserError(f"unknown key '{name}.{key}': {_hint(key, names)}")
     try:
         return cls(**values)
     except UserError as error:
@@ -295,12 +304,12 @@ def _parse(value: Any, default: Any) -> Any:
     return value
 
 
-def nearest_hint(name: str, valid: Iterable[str], otherwise: str | None = None) -> str:
+def _hint(name: str, valid: Iterable[str]) -> str:
     """What to say of a name that is none of the valid ones."""
-    near = nearest(name, valid)
-    return f"did you mean {near!r}?" if near else otherwise or f"valid are {', '.join(valid)}"
+    near = _nearest(name, valid)
+    return f"did you mean {near!r}?" if near else f"valid are {', '.join(valid)}"
 
 
-def nearest(name: str, valid: Iterable[str]) -> str | None:
+def _nearest(name: str, valid: Iterable[str]) -> str | None:
     """The valid name that is most like another, if any is."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)

@@ -167,6 +167,7 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
     ("arguments", "said"),
     [
         (["--batch-sise", "3"], "did you mean --batch-size?"),
+        (["--zzz"], "unknown option --zzz: see arm5dof train --help"),
         (["--batch-size", "many"], "valid integer"),
         (["--batch-size"], "needs a value"),
         (["--discount", "1.5"], "less than or equal to 1"),
@@ -362,6 +363,9 @@ def test_help_lists_every_setting(capsys):
     assert caught.value.code == 0
     text = capsys.readouterr().out
     assert "--resume" in text and "--actor-lr" in text and "--substeps" in text
+    with pytest.raises(SystemExit):
+        run("train", "kinematic.toml", "--help")
+    assert "(default kinematic)" in " ".join(capsys.readouterr().out.split()), "as the experiment has it"
     assert run() == 0 and "COMMAND" in capsys.readouterr().out
 
 

@@ -179,8 +179,8 @@ def edit(folder: Path, **changes: object) -> Run:
 def test_every_edited_setting_is_refused_by_name_or_may_change(runs: dict[str, Path], elsewhere: Path):
     folder = copy(runs["half"], elsewhere / "edited")
     text = (folder / "config.toml").read_text()
-    now = Run.open(folder).config.flat()
-    known = [(f"{f.section}.{f.name}", f) for f in config.fields(now["env.task"])]
+    settings = Run.open(folder).config
+    now, known = settings.flat(), [(f"{f.section}.{f.name}", f) for f in config.fields(settings)]
     assert {"env.task", *(name for name, _ in known)} == now.keys() > MAY_CHANGE
     for name, f in known:
         value = another(now[name], f.choices)
