@@ -93,7 +93,8 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     Args:
         experiment: A TOML file, or the name of one that ships.
         overrides: Values by name: `batch_size=128`, or with its section where a name is not unique:
-            `**{"ddpg.batch_size": 128}`. Text is read as on a command line.
+            `**{"ddpg.batch_size": 128}`. Text is read as on a command line, a tuple as
+            `mark="0.1, 0.2"`.
 
     Raises:
         UserError: There is no such file or setting, or a value is not of its type and range.
@@ -293,9 +294,14 @@ def _descriptions(cls: type) -> dict[str, tuple[str, list[str] | None]]:
 
 
 def _parse(value: Any, default: Any) -> Any:
-    """A command line's text as the value that it spells; what is no text, or is to be some, stays."""
+    """A command line's text as the value that it spells, `0.1, 0.2` for a tuple; what is no text, or is to be some,
+    stays."""
     if not isinstance(value, str) or isinstance(default, str):
         return value
+    if isinstance(default, tuple):
+        parts = value.strip("()[] ").removesuffix(",").split(",")
+        examples = [*default, *default[-1:] * len(parts)] or [None] * len(parts)
+        return tuple(_parse(part.strip(), example) for part, example in zip(parts, examples, strict=False))
     if isinstance(default, bool):
         return {"true": True, "false": False}.get(value.lower(), value)
     for number in (int, float):
