@@ -12,6 +12,7 @@ import sys
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -182,6 +183,8 @@ def task_class(task: str, folder: Path | None = None) -> type[Task]:
         raise UserError(
             f"cannot import task {task!r} ({reason}): put its folder on PYTHONPATH, or start from there"
         ) from error
+    if folder is not None and not shipped:
+        _check_origin(module.partition(".")[0], folder)
     is_task = isinstance(found, type) and issubclass(found, Task)
     if not is_task or not dataclasses.is_dataclass(getattr(found, "Config", None)):
         raise UserError(f"{task!r} is no task: it takes a class that inherits from arm5dof.Task and has a Config")
@@ -278,6 +281,15 @@ def _import(module: str, folder: Path | None) -> Any:
             sys.path.append(str(place.resolve()))
     importlib.invalidate_caches()
     return importlib.import_module(module)
+
+
+def _check_origin(module: str, folder: Path) -> None:
+    """Raise `UserError` if a folder has an imported module of its own that is not the one imported."""
+    own, used = PathFinder.find_spec(module, [str(folder)]), getattr(sys.modules[module], "__file__", None)
+    if own and own.has_location and Path(str(used)).resolve() != Path(str(own.origin)).resolve():
+        raise UserError(
+            f"module {module!r} is {used} here and not {own.origin}: rename one of them, or use a process for each"
+        )
 
 
 @functools.cache

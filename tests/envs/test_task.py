@@ -263,6 +263,21 @@ def test_settings_of_all_sorts_survive_a_run(tmp_path: Path, monkeypatch: pytest
     assert {e["return"]["max"] <= 0 for e in run.evaluations} == {True}
 
 
+def test_modules_of_one_name_in_two_folders_are_not_mistaken_for_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for folder in (tmp_path / "mine", tmp_path / "theirs"):
+        folder.mkdir()
+        (folder / "archer.py").write_text(MARKSMAN)
+        (folder / "archer.toml").write_text('[env]\ntask = "archer:Marksman"\n')
+    (tmp_path / "archer.toml").write_text('[env]\ntask = "archer:Marksman"\n')
+    mine = load_config(tmp_path / "mine/archer.toml")
+    assert load_config(tmp_path / "mine/archer.toml") == mine == load_config(tmp_path / "archer.toml")
+    text = said(lambda: load_config(tmp_path / "theirs/archer.toml"))
+    assert f"'archer' is {tmp_path}/mine/archer.py here and not {tmp_path}/theirs/archer.py: rename one" in text
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_pendulum_swings_up(seed: int, monkeypatch: pytest.MonkeyPatch):
     """With the settings that ship, 10,000 transitions: a mean return above -200 over 1,000 episodes."""
