@@ -95,8 +95,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         with Bar("training", current.config.train.episodes, "episodes") as bar:
             runs.resume(current, bar, trainer)
     except UserError as error:
-        if args.resume is None:
-            raise UserError(f"{error} with arm5dof train --resume {current.folder}") from None
+        if args.resume is None and current.has_checkpoint:
+            raise UserError(f"{error}; go on with arm5dof train --resume {current.folder}") from None
         raise
     print(tables(current.env.metrics, current.evaluations[-1]))
     print(f"figure and report: {current.folder / 'report.md'}")

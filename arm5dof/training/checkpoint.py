@@ -75,7 +75,8 @@ class Checkpoints:
         items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
         record = {name: _describe(leaves) for name, leaves in items.items()}
         record |= {"settings": self._settings, "budget": self._budget}
-        failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, resume from that"
+        kept = "" if self.latest is None else ", the last complete one is kept"
+        failure = f"cannot write a checkpoint to {self.folder}{kept}"
         with _as_user_error(failure):
             self._manager.save(
                 int(training.steps),

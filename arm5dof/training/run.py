@@ -130,10 +130,15 @@ class Run:
         """The run's training program."""
         return Trainer(self.env, self.config)
 
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is one to answer with and to go on from."""
+        return any(path.name.isdigit() for path in (self.folder / "checkpoints").glob("*"))
+
     def policy(self) -> Policy:
         """The policy of the newest checkpoint. Raises `UserError` if there is none, or it was made with other
         settings."""
-        if not (self.folder / "checkpoints").is_dir():
+        if not self.has_checkpoint:
             raise UserError(f"{self.folder} has no checkpoint yet: resume it")
         checkpoints = self._checkpoints(read_only=True)
         checkpoints.check()

@@ -339,6 +339,23 @@ sys.exit(main(sys.argv[1:]))
     assert json.loads((folder / "evaluations.json").read_text())[-1]["episodes"] == 4
 
 
+@pytest.mark.parametrize("saved", [0, 1])
+def test_how_to_go_on_is_said_where_there_is_something_to_go_on_from(saved, fails, tmp_path, monkeypatch):
+    save, calls = Checkpoints.save, []
+
+    def limited(self, training):
+        calls.append(self)
+        if len(calls) > saved:
+            raise UserError("no more")
+        save(self, training)
+
+    monkeypatch.setattr(Checkpoints, "save", limited)
+    said = fails("train", *TINY.split(), "--out", tmp_path / "run")
+    assert said == "arm5dof: no more" + f"; go on with arm5dof train --resume {tmp_path / 'run'}" * saved
+    assert Run.open(tmp_path / "run").has_checkpoint == bool(saved)
+    assert saved or "no checkpoint yet" in fails("eval", tmp_path / "run")
+
+
 def test_failures_that_nobody_waits_for_are_silent(caplog, capfd):
     """After a first write has failed, tensorstore's others may or may not fail in time for someone to ask."""
 
