@@ -29,7 +29,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof eval`."""
-    nothing_left(rest)
+    nothing_left(rest, "eval")
     from arm5dof.runtime.progress import Bar
     from arm5dof.training.evaluate import tables
     from arm5dof.training.run import Run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from arm5dof.errors import UserError
@@ -34,7 +35,7 @@ def natural(text: str) -> int:
     return value
 
 
-def nothing_left(rest: list[str]) -> None:
+def nothing_left(rest: Sequence[str], command: str) -> None:
     """Raise `UserError` if the command line has something that its command does not know."""
     if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see --help)")
+        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof {command} --help)")

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     parser = Parser(prog="arm5dof solve", add_help=False)
     _declare_goal(parser, model, units)
     more, rest = parser.parse_known_args(rest)
-    nothing_left(rest)
+    nothing_left(rest, "solve")
     inputs = _inputs(args.csv, vars(more), model)
     tolerances = {name: getattr(more, f"tolerance_{unit.unit}") for name, unit in units.items()}
 
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:
     """The run, which is the one word that is neither an option nor a number, and the other words."""
     words = [word for word in rest if not word.startswith("--") and not _is_number(word)]
-    nothing_left(words[1:])
+    nothing_left(words[1:], "solve")
     return (Path(words[0]) if words else None), [word for word in rest if word not in words]
 
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import options
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision calibrate`."""
-    options.nothing_left(rest, "calibrate")
+    nothing_left(rest, "vision calibrate")
     options.writable(args.out, (".yml", ".yaml"))
     if args.preview is not None:
         options.writable(args.preview, (".png", ".jpg"))

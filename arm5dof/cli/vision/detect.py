@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import detecting, options
+from arm5dof.cli.parser import nothing_left
+from arm5dof.cli.vision import detecting
 
 if TYPE_CHECKING:
     from arm5dof.vision.io.sinks import Write
@@ -57,7 +58,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> int:
     """`arm5dof vision detect`."""
-    options.nothing_left(rest, "detect")
+    nothing_left(rest, "vision detect")
 
     from arm5dof.vision.io.sources import open_source
 

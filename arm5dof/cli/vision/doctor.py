@@ -10,7 +10,7 @@ import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.parser import nothing_left
 
 if TYPE_CHECKING:
     from arm5dof.vision.evaluation.doctor import Finding
@@ -33,7 +33,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision doctor`."""
-    options.nothing_left(rest, "doctor")
+    nothing_left(rest, "vision doctor")
     broken = _broken_choice()
 
     from arm5dof.vision.evaluation import doctor

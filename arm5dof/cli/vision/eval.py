@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision eval`."""
-    options.nothing_left(rest, "eval")
+    nothing_left(rest, "vision eval")
     for name, least in (("scenes", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise UserError(f"--{name} is {least} or more, not {getattr(args, name)}")

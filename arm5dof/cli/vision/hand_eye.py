@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
 
 HELP = """\
@@ -50,7 +51,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision hand-eye`."""
-    options.nothing_left(rest, "hand-eye")
+    nothing_left(rest, "vision hand-eye")
     options.writable(args.out, (".yml", ".yaml"))
 
     from arm5dof.runtime.progress import late_bar

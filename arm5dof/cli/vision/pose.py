@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
 from arm5dof.errors import UserError
 
@@ -57,7 +58,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision pose`."""
-    options.nothing_left(rest, "pose")
+    nothing_left(rest, "vision pose")
     options.writable(args.out, (".yml", ".yaml"))
     board_to_base, placement_std = _at(args.at), _placed(args.placed)
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision train`."""
-    options.nothing_left(rest, "train")
+    nothing_left(rest, "vision train")
     if args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
 
