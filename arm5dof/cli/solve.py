@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 HELP = """\
 Ask a trained policy for joint angles.
 
-  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the arm's base frame
+  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the world frame
   arm5dof solve runs/reach --target 0.1 0 0.2 --target ...  several
   arm5dof solve runs/reach --csv points.csv --out answers.csv
   arm5dof solve runs/reach --help                           how a goal is stated to this run's policy
