@@ -27,8 +27,9 @@ Ask a trained policy for joint angles.
   arm5dof solve runs/reach --csv points.csv --out answers.csv
   arm5dof solve runs/reach --help                           how a goal is stated to this run's policy
 
-A CSV has a header with x, y and z, and whatever else the run's task wants to know. Exit status 2 if a target is not
-reached within the tolerances.
+A CSV has a header with x, y and z, and whatever else the run's task wants to know. Joint positions are radians, and
+metres for slides, in JSON and CSV, degrees and millimetres otherwise. Exit status 2 if a target is not reached within
+the tolerances.
 """
 
 Inputs = dict[str, list[list[float]]]
@@ -90,10 +91,10 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     rows: list[dict[str, Any]] = [
         {
             **{_key(name): values[i] for name, values in inputs.items()},
-            "joints_rad": dict(zip(model.joint_names, map(float, angles), strict=True)),
+            **_joints(model, answer.q[i].tolist()),
             **{f"error_{units[name].unit}": values[i] for name, values in errors.items()},
         }
-        for i, angles in enumerate(answer.q)
+        for i in range(len(answer.q))
     ]
     if args.json:
         print(json.dumps(rows))
@@ -111,6 +112,14 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
             f"{reached.count(False)} of {len(rows)} targets not reached within {limits}: ({point}) m is missed by "
             f"{errors[name][worst]:.1f} {units[name].unit}; {model.workspace}"
         )
+
+
+def _joints(model: ForwardModel, q: list[float]) -> dict[str, dict[str, float]]:
+    """Joint positions by name: those of hinges in radians, and those of slides, where there are any, in metres."""
+    named = list(zip(model.joint_names, q, model.slides, strict=True))
+    slides = {name: value for name, value, slides in named if slides}
+    hinges = {name: value for name, value, slides in named if not slides}
+    return {"joints_rad": hinges} | ({"joints_m": slides} if slides else {})
 
 
 def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:
@@ -182,7 +191,8 @@ def _read_csv(path: Path, model: ForwardModel) -> Inputs:
 def _csv(
     rows: list[dict[str, Any]], inputs: Inputs, reached: list[bool], model: ForwardModel, units: Mapping[str, Error]
 ) -> str:
-    """The text of a file with a row for each answer: goal, joint angles in radians, errors and whether it counts."""
+    """The text of a file with a row for each answer: goal, joint positions in radians (metres for slides), errors and
+    whether it counts."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     errors = [f"error_{unit.unit}" for unit in units.values()]
@@ -191,8 +201,9 @@ def _csv(
     )
     for row, counts in zip(rows, reached, strict=True):
         goal = [value for name in inputs for value in row[_key(name)]]
-        angles = [f"{value:.7f}" for value in row["joints_rad"].values()]
-        writer.writerow([*goal, *angles, *(f"{row[error]:.4f}" for error in errors), int(counts)])
+        joints = row["joints_rad"] | row.get("joints_m", {})
+        positions = [f"{joints[name]:.7f}" for name in model.joint_names]
+        writer.writerow([*goal, *positions, *(f"{row[error]:.4f}" for error in errors), int(counts)])
     return text.getvalue()
 
 
@@ -200,9 +211,11 @@ def _line(row: Mapping[str, Any], inputs: Inputs, units: Mapping[str, Error]) ->
     """An answer for people."""
     goal = " ".join(f"{1e3 * v:.1f}" for v in row["target_m"]) + " mm"
     goal += "".join(f", {name} {' '.join(f'{v:g}' for v in row[name])}" for name in inputs if name != "target")
-    angles = "  ".join(f"{name} {math.degrees(value):.2f}" for name, value in row["joints_rad"].items())
+    angles = [f"{name} {math.degrees(value):.2f}" for name, value in row["joints_rad"].items()]
+    slides = [f"{name} {1e3 * value:.2f}" for name, value in row.get("joints_m", {}).items()]
+    joints = [f"{'  '.join(of_unit)} {unit}" for of_unit, unit in ((angles, "degrees"), (slides, "mm")) if of_unit]
     errors = "  ".join(f"{row[f'error_{unit.unit}']:.2f} {unit.unit}" for unit in units.values())
-    return f"{goal}:  {angles} degrees  error {errors}"
+    return f"{goal}:  {'  '.join(joints)}  error {errors}"
 
 
 def _key(name: str) -> str:

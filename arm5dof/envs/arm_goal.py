@@ -209,6 +209,10 @@ class ArmGoalEnv(Task):
         return self.arm.joint_names
 
     @property
+    def slides(self) -> tuple[bool, ...]:
+        return self.arm.slides
+
+    @property
     def branches(self) -> int:
         """See `ForwardModel`."""
         return int(self.config.branches)

@@ -202,6 +202,11 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
+    def slides(self) -> tuple[bool, ...]:
+        """Which of them are metres, since the joint slides, rather than radians."""
+        ...
+
+    @property
     def branches(self) -> int:
         """How many of a policy's candidate answers are followed where answers are corrected."""
         ...
@@ -225,7 +230,7 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     def joints(self, action: jax.Array) -> jax.Array:
-        """The joint positions that an action asks for, (dof,)."""
+        """The joint positions that an action asks for, (dof,), radians (metres for slides)."""
         ...
 
     def errors(self, achieved: Goal, goal: Goal) -> dict[str, jax.Array]:
