@@ -10,10 +10,12 @@ from arm5dof.errors import UserError
 
 
 class Parser(argparse.ArgumentParser):
-    """One clear line for a bad command line, as for all other bad input, and no guessing at shortened options."""
+    """One clear line for a bad command line, as for all other bad input, no guessing at shortened options, and
+    descriptions that keep their lines."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **{**kwargs, "allow_abbrev": False})
+        fixed = {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
+        super().__init__(*args, **{**kwargs, **fixed})
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{message} (see {self.prog} --help)")

@@ -39,13 +39,11 @@ Inputs = dict[str, list[list[float]]]
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `solve` to the commands."""
     usage = "arm5dof solve RUN (--target X Y Z ... | --csv IN.csv [--out OUT.csv]) [options]"
-    raw = argparse.RawDescriptionHelpFormatter
     p = commands.add_parser(
         "solve",
         help="ask a policy for joint angles",
         usage=usage,
         description=HELP,
-        formatter_class=raw,
         add_help=False,
     )
     # RUN is not declared: beside targets, which only the run's task knows, it would swallow their numbers.

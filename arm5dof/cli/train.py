@@ -49,10 +49,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     """Add `train` to the commands."""
     # The experiment is not declared: next to settings that argparse does not know it would swallow their values.
     usage = "arm5dof train [EXPERIMENT.toml] [--SETTING VALUE ...] [--out DIR] [--resume DIR] [--smoke]"
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(
-        "train", help="train a policy", usage=usage, description=HELP, formatter_class=raw, add_help=False
-    )
+    p = commands.add_parser("train", help="train a policy", usage=usage, description=HELP, add_help=False)
     # Help lists the settings, and importing those takes JAX, so only help pays for it.
     p.add_argument("-h", "--help", action="store_true", help="show this help, every setting included")
     p.add_argument("--out", type=Path, metavar="DIR", help="the run's folder; default: runs/<experiment>")

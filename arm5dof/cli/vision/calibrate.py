@@ -35,10 +35,7 @@ photographs are too few, show another board, or leave the intrinsics uncertain.
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `calibrate` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(
-        "calibrate", help="calibrate a camera from photographs", description=HELP, formatter_class=raw
-    )
+    p = commands.add_parser("calibrate", help="calibrate a camera from photographs", description=HELP)
     p.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="photographs, or folders of them")
     options.add_board(p)
     p.add_argument(

@@ -48,8 +48,7 @@ the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so 
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `detect` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("detect", help="find objects in images", description=HELP, formatter_class=raw)
+    p = commands.add_parser("detect", help="find objects in images", description=HELP)
     p.add_argument("source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, or simulated")
     detecting.add_options(p)
     p.add_argument("--json", action="store_true", help="print what goes into detections.json, frame by frame")

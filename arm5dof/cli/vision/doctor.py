@@ -25,8 +25,7 @@ Nothing needs OpenGL. Software renders the same, more slowly, and is used where 
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `doctor` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("doctor", help="what works on this machine", description=HELP, formatter_class=raw)
+    p = commands.add_parser("doctor", help="what works on this machine", description=HELP)
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run)
 

@@ -31,8 +31,7 @@ Scenes are rendered with OpenGL where that works (see arm5dof vision doctor), ot
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `eval` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("eval", help="measure the detector that ships", description=HELP, formatter_class=raw)
+    p = commands.add_parser("eval", help="measure the detector that ships", description=HELP)
     p.add_argument("--weights", type=Path, metavar="FILE", help="what arm5dof vision train wrote; default: what ships")
     p.add_argument("--scenes", type=int, default=1000, metavar="N", help="default 1000")
     p.add_argument("--seed", type=int, default=1, metavar="S", help="of the scenes; default 1")

@@ -34,10 +34,7 @@ hand's frame: arm5dof vision locate takes the hand's pose with it.
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `hand-eye` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(
-        "hand-eye", help="find where a camera stands by moving the hand", description=HELP, formatter_class=raw
-    )
+    p = commands.add_parser("hand-eye", help="find where a camera stands by moving the hand", description=HELP)
     p.add_argument("camera", type=Path, metavar="CAMERA.yml", help="the calibrated camera")
     p.add_argument("poses", type=Path, metavar="POSES.csv", help="photographs and the hand's poses")
     where = p.add_mutually_exclusive_group(required=True)

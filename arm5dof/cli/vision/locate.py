@@ -68,8 +68,7 @@ frames before, as with vision detect.
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `locate` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("locate", help="tell where objects are", description=HELP, formatter_class=raw)
+    p = commands.add_parser("locate", help="tell where objects are", description=HELP)
     p.add_argument(
         "source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, simulated; or JSON"
     )

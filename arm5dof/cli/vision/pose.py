@@ -37,8 +37,7 @@ The pose goes into a new file beside the intrinsics, with the covariance of both
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `pose` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("pose", help="find where a camera stands", description=HELP, formatter_class=raw)
+    p = commands.add_parser("pose", help="find where a camera stands", description=HELP)
     p.add_argument("camera", type=Path, metavar="CAMERA.yml", help="the calibrated camera")
     p.add_argument("image", type=Path, metavar="IMAGE", help="a photograph of the board")
     options.add_board(p)

@@ -39,8 +39,7 @@ BARS = {
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `train` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("train", help="train the detector that ships", description=HELP, formatter_class=raw)
+    p = commands.add_parser("train", help="train the detector that ships", description=HELP)
     p.add_argument("--out", type=Path, default=Path("runs/detector"), metavar="FOLDER", help="default: runs/detector")
     p.add_argument("--seed", type=int, metavar="S", help="of all random numbers; default 0")
     p.add_argument("--scenes", type=int, metavar="N", help="images to render; default 3500")
