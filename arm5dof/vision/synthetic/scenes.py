@@ -15,7 +15,7 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
-from arm5dof.vision.objects import CATALOGUE, CatalogueObject
+from arm5dof.vision.objects import CATALOGUE
 from arm5dof.vision.synthetic import textures
 from arm5dof.vision.synthetic.scene_builder import CAMERA, SECOND, SceneBuilder, distractor
 
@@ -44,11 +44,6 @@ class PlacedObject:
     """About z, radians."""
     geoms: np.ndarray
     """Ids of its geoms, (n,)."""
-
-    @property
-    def catalogue_object(self) -> CatalogueObject:
-        """What it is."""
-        return CATALOGUE[self.class_id]
 
 
 @dataclass(frozen=True, eq=False)
