@@ -147,7 +147,8 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
         task = values.get("env", {}).get("task", "reach")
         classes = {"env": task_class(task, folder).Config, "ddpg": DDPGConfig, "train": TrainConfig}
         classes["evaluate"] = EvaluateConfig
-        shipped = _task_defaults(task) if fill else {}
+        path = files.shipped_file("experiments", f"{task}.toml") if fill and ":" not in task else None
+        shipped = {} if path is None else _read(path)
         merged = {section: {**shipped.get(section, {}), **values.get(section, {})} for section in SECTIONS}
         merged["env"].pop("task", None)
         return Config(task, **{name: _section(name, classes[name], merged[name]) for name in SECTIONS})
@@ -259,12 +260,6 @@ def _section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
         return cls(**values)
     except UserError as error:
         raise UserError(f"{name}.{error}") from None
-
-
-def _task_defaults(task: str) -> dict[str, Any]:
-    """What the TOML file of a task that ships says."""
-    path = files.shipped_file("experiments", f"{task}.toml") if ":" not in task else None
-    return {} if path is None else _read(path)
 
 
 def _read(path: Path) -> dict[str, Any]:
