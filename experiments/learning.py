@@ -130,7 +130,8 @@ def poses(title: str, found: dict[str, list[dict]], seeds: int) -> str:
     """Mean errors of one answer, and the shares of goals that are met in both position and direction."""
     lines = [
         *heading(title, seeds),
-        "| | seeds | transitions | updates | one answer: mean error | <= 5 mm and 3 deg | corrected: <= 1 mm, 0.5 deg |",
+        "| | seeds | transitions | updates | one answer, mean error | <= 5 mm and 3 deg "
+        "| corrected: <= 1 mm and 0.5 deg |",
         "| --- |" + " ---: |" * 6,
     ]
     for name, evaluations in found.items():

@@ -1,6 +1,7 @@
 """What a user installs: the wheel carries the models and experiments, and needs no torch."""
 
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import arm5dof
 from arm5dof.runtime import files
 
 ROOT = Path(__file__).parent.parent
@@ -53,6 +55,16 @@ def test_wheel_carries_all_experiments_and_neither_results_nor_test_data(wheel):
     (weights,) = [info for info in zipfile.ZipFile(wheel).infolist() if info.filename.endswith(".npz")]
     assert weights.file_size <= 2_000_000
     assert wheel.stat().st_size - weights.compress_size < 500_000
+
+
+def test_one_version_is_told_everywhere(wheel):
+    """A version under way ends in .dev0 and is "unreleased"; the citation names the newest that is out."""
+    history = re.findall(r"^## \[(.+)\] - (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    released = [(version, date) for version, date in history if date != "unreleased"]
+    assert arm5dof.__version__ == (history[0][0] if history[0] in released else f"{history[0][0]}.dev0")
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert "\nversion: {}\ndate-released: {}\n".format(*released[0]) in citation
+    assert wheel.name.startswith(f"arm5dof-{arm5dof.__version__}-")
 
 
 def test_no_torch_at_run_time():

@@ -95,6 +95,11 @@ class Arm:
         return tuple(self.mj_model.joint(int(j)).name or f"joint_{j}" for j in self.joints)
 
     @property
+    def slides(self) -> tuple[bool, ...]:
+        """Which joints are slides, whose positions are metres, (dof,)."""
+        return tuple(link.slides for link in self.chain[:-1])
+
+    @property
     def home(self) -> np.ndarray:
         """The middle of every joint's range, (dof,)."""
         return (self.lower + self.upper) / 2
@@ -192,11 +197,12 @@ class Arm:
         return self.to_joints(jax.random.uniform(key, (*shape, self.dof), minval=-1.0, maxval=1.0))
 
     def _table(self) -> Table:
-        hinge = self.mj_model.jnt_type[self.joints] == int(mujoco.mjtJoint.mjJNT_HINGE)
-        limits = np.stack([self.lower, self.upper], axis=1) * np.where(hinge, 180 / np.pi, 1e3)[:, None]
+        limits = np.stack([self.lower, self.upper], axis=1) * np.where(self.slides, 1e3, 180 / np.pi)[:, None]
         rows = [
-            (name, "hinge" if turns else "slide", f"{low:.1f}", f"{high:.1f}", "yes" if actuator >= 0 else "no")
-            for name, turns, (low, high), actuator in zip(self.joint_names, hinge, limits, self.actuators, strict=True)
+            (name, "slide" if slides else "hinge", f"{low:.1f}", f"{high:.1f}", "yes" if actuator >= 0 else "no")
+            for name, slides, (low, high), actuator in zip(
+                self.joint_names, self.slides, limits, self.actuators, strict=True
+            )
         ]
         title = (
             f"Arm of {self.dof} joints, end effector {self.mj_model.site(self.site).name!r}, reach {self.reach:.3f} m"

@@ -18,8 +18,7 @@ Measure a policy on targets that it has never seen, or on episodes where its tas
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `eval` to the commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("eval", help="measure a policy's accuracy", description=HELP, formatter_class=raw)
+    p = commands.add_parser("eval", help="measure a policy's accuracy", description=HELP)
     p.add_argument("run_folder", type=Path, metavar="RUN", help="a run's folder")
     p.add_argument("--targets", type=positive, help="how many; default: as configured (10,000)")
     p.add_argument("--seed", type=natural, default=0, help="of the targets; default 0")
@@ -29,7 +28,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof eval`."""
-    nothing_left(rest)
+    nothing_left(rest, "eval")
     from arm5dof.runtime.progress import Bar
     from arm5dof.training.evaluate import tables
     from arm5dof.training.run import Run

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from arm5dof.errors import UserError
 
 
 class Parser(argparse.ArgumentParser):
-    """One clear line for a bad command line, as for all other bad input, and no guessing at shortened options."""
+    """One clear line for a bad command line, as for all other bad input, no guessing at shortened options, and
+    descriptions that keep their lines."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **{**kwargs, "allow_abbrev": False})
+        fixed = {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
+        super().__init__(*args, **{**kwargs, **fixed})
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{message} (see {self.prog} --help)")
@@ -34,7 +37,7 @@ def natural(text: str) -> int:
     return value
 
 
-def nothing_left(rest: list[str]) -> None:
+def nothing_left(rest: Sequence[str], command: str) -> None:
     """Raise `UserError` if the command line has something that its command does not know."""
     if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see --help)")
+        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof {command} --help)")

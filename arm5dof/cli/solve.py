@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 HELP = """\
 Ask a trained policy for joint angles.
 
-  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the arm's base frame
+  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the world frame
   arm5dof solve runs/reach --target 0.1 0 0.2 --target ...  several
   arm5dof solve runs/reach --csv points.csv --out answers.csv
   arm5dof solve runs/reach --help                           how a goal is stated to this run's policy
 
-A CSV has a header with x, y and z, and whatever else the run's task wants to know. Exit status 2 if a target is not
-reached within the tolerances.
+A CSV has a header with x, y and z, and whatever else the run's task wants to know. Joint positions are radians, and
+metres for slides, in JSON and CSV, degrees and millimetres otherwise. Exit status 2 if a target is not reached within
+the tolerances.
 """
 
 Inputs = dict[str, Any]
@@ -38,13 +39,11 @@ Inputs = dict[str, Any]
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `solve` to the commands."""
     usage = "arm5dof solve RUN (--target X Y Z ... | --csv IN.csv [--out OUT.csv]) [options]"
-    raw = argparse.RawDescriptionHelpFormatter
     p = commands.add_parser(
         "solve",
         help="ask a policy for joint angles",
         usage=usage,
         description=HELP,
-        formatter_class=raw,
         add_help=False,
     )
     # RUN is not declared: beside targets, which only the run's task knows, it would swallow their numbers.
@@ -80,7 +79,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     parser = Parser(prog="arm5dof solve", add_help=False)
     _declare_goal(parser, model, units)
     more, rest = parser.parse_known_args(rest)
-    nothing_left(rest)
+    nothing_left(rest, "solve")
     inputs = _inputs(args.csv, vars(more), model)
     tolerances = {name: getattr(more, f"tolerance_{unit.unit}") for name, unit in units.items()}
 
@@ -90,10 +89,10 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     rows: list[dict[str, Any]] = [
         {
             **{_key(name): values[i] for name, values in inputs.items()},
-            "joints_rad": dict(zip(model.joint_names, map(float, angles), strict=True)),
+            **_joints(model, answer.q[i].tolist()),
             **{f"error_{units[name].unit}": values[i] for name, values in errors.items()},
         }
-        for i, angles in enumerate(answer.q)
+        for i in range(len(answer.q))
     ]
     if args.json:
         print(json.dumps(rows))
@@ -113,10 +112,18 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         )
 
 
+def _joints(model: ForwardModel, q: list[float]) -> dict[str, dict[str, float]]:
+    """Joint positions by name: those of hinges in radians, and those of slides, where there are any, in metres."""
+    named = list(zip(model.joint_names, q, model.slides, strict=True))
+    slides = {name: value for name, value, slides in named if slides}
+    hinges = {name: value for name, value, slides in named if not slides}
+    return {"joints_rad": hinges} | ({"joints_m": slides} if slides else {})
+
+
 def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:
     """The run, which is the one word that is neither an option nor a number, and the other words."""
     words = [word for word in rest if not word.startswith("--") and not _is_number(word)]
-    nothing_left(words[1:])
+    nothing_left(words[1:], "solve")
     return (Path(words[0]) if words else None), [word for word in rest if word not in words]
 
 
@@ -182,7 +189,8 @@ def _read_csv(path: Path, model: ForwardModel) -> Inputs:
 def _csv(
     rows: list[dict[str, Any]], inputs: Inputs, reached: list[bool], model: ForwardModel, units: Mapping[str, Error]
 ) -> str:
-    """The text of a file with a row for each answer: goal, joint angles in radians, errors and whether it counts."""
+    """The text of a file with a row for each answer: goal, joint positions in radians (metres for slides), errors and
+    whether it counts."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     errors = [f"error_{unit.unit}" for unit in units.values()]
@@ -191,8 +199,9 @@ def _csv(
     )
     for row, counts in zip(rows, reached, strict=True):
         goal = [value for name in inputs for value in row[_key(name)]]
-        angles = [f"{value:.7f}" for value in row["joints_rad"].values()]
-        writer.writerow([*goal, *angles, *(f"{row[error]:.4f}" for error in errors), int(counts)])
+        joints = row["joints_rad"] | row.get("joints_m", {})
+        positions = [f"{joints[name]:.7f}" for name in model.joint_names]
+        writer.writerow([*goal, *positions, *(f"{row[error]:.4f}" for error in errors), int(counts)])
     return text.getvalue()
 
 
@@ -200,9 +209,11 @@ def _line(row: Mapping[str, Any], inputs: Inputs, units: Mapping[str, Error]) ->
     """An answer for people."""
     goal = " ".join(f"{1e3 * v:.1f}" for v in row["target_m"]) + " mm"
     goal += "".join(f", {name} {' '.join(f'{v:g}' for v in row[name])}" for name in inputs if name != "target")
-    angles = "  ".join(f"{name} {math.degrees(value):.2f}" for name, value in row["joints_rad"].items())
+    angles = [f"{name} {math.degrees(value):.2f}" for name, value in row["joints_rad"].items()]
+    slides = [f"{name} {1e3 * value:.2f}" for name, value in row.get("joints_m", {}).items()]
+    joints = [f"{'  '.join(of_unit)} {unit}" for of_unit, unit in ((angles, "degrees"), (slides, "mm")) if of_unit]
     errors = "  ".join(f"{row[f'error_{unit.unit}']:.2f} {unit.unit}" for unit in units.values())
-    return f"{goal}:  {angles} degrees  error {errors}"
+    return f"{goal}:  {'  '.join(joints)}  error {errors}"
 
 
 def _key(name: str) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
-    from arm5dof.training.config import Config, Field
+    from arm5dof.training.config import Config
 
 HELP = """\
 Train a policy.
@@ -29,8 +29,8 @@ a folder with its configuration, its robot, metrics, checkpoints, a figure and r
   arm5dof train --resume runs/reach                 go on with a run that was stopped
   arm5dof train my.toml --help                      the settings of that experiment's task
 
-A resumed run may have other episodes, evaluate_every, checkpoint_every, targets and interim_targets in its config.toml;
-every other setting is as it was.
+A resumed run may have other episodes, evaluate_every, checkpoint_every, targets, interim_targets, branches and
+refinements in its config.toml; every other setting is as it was.
 """
 
 SMOKE = {
@@ -49,10 +49,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     """Add `train` to the commands."""
     # The experiment is not declared: next to settings that argparse does not know it would swallow their values.
     usage = "arm5dof train [EXPERIMENT.toml] [--SETTING VALUE ...] [--out DIR] [--resume DIR] [--smoke]"
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(
-        "train", help="train a policy", usage=usage, description=HELP, formatter_class=raw, add_help=False
-    )
+    p = commands.add_parser("train", help="train a policy", usage=usage, description=HELP, add_help=False)
     # Help lists the settings, and importing those takes JAX, so only help pays for it.
     p.add_argument("-h", "--help", action="store_true", help="show this help, every setting included")
     p.add_argument("--out", type=Path, metavar="DIR", help="the run's folder; default: runs/<experiment>")
@@ -95,8 +92,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         with Bar("training", current.config.train.episodes, "episodes") as bar:
             runs.resume(current, bar, trainer)
     except UserError as error:
-        if args.resume is None:
-            raise UserError(f"{error} with arm5dof train --resume {current.folder}") from None
+        if args.resume is None and current.has_checkpoint:
+            raise UserError(f"{error}; go on with arm5dof train --resume {current.folder}") from None
         raise
     print(tables(current.env.metrics, current.evaluations[-1]))
     print(f"figure and report: {current.folder / 'report.md'}")
@@ -106,25 +103,18 @@ def _configure(experiment: str, texts: dict[str, str], smoke: bool) -> Config:
     """The configuration that a command line asks for."""
     from arm5dof.training import config
 
-    fields = config.fields(config.load_config(experiment).task)
-    given = {_setting(name, fields).name for name in texts}
-    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
+    found = config.load_config(experiment)
+    fields = config.fields(found)
+    try:
+        given = {config.find(name, fields).name for name in texts}
+    except config.UnknownSettingError as error:
+        hint = f"did you mean --{error.nearest.replace('_', '-')}?" if error.nearest else "see arm5dof train --help"
+        raise UserError(f"unknown option --{error.name}: {hint}") from None
     for name, value in texts.items():
         if not value:
             raise UserError(f"--{name} needs a value")
-    return config.load_config(experiment, **short, **texts)
-
-
-def _setting(name: str, fields: list[Field]) -> Field:
-    """The setting of that name, with options in what is said of a name that is none."""
-    from arm5dof.training import config
-
-    near = config.nearest(name.replace("-", "_"), [key for f in fields for key in (f.name, f"{f.section}.{f.name}")])
-    known = [f for f in fields if name.replace("-", "_") in (f.name, f"{f.section}.{f.name}")]
-    if not known:
-        hint = f"did you mean --{near.replace('_', '-')}?" if near else "see arm5dof train --help"
-        raise UserError(f"unknown option --{name}: {hint}")
-    return config.find(name, fields)
+    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
+    return config.override(found, {**short, **texts})
 
 
 def _experiment_and_settings(rest: list[str]) -> tuple[str | None, dict[str, str]]:
@@ -151,11 +141,11 @@ def _print_help(parser: argparse.ArgumentParser, experiment: str) -> None:
     from arm5dof.training import config
 
     section = None
-    for f in config.fields(config.load_config(experiment).task):
+    for f in config.fields(config.load_config(experiment)):
         if f.section != section:
             section = f.section
             group = parser.add_argument_group(f"settings [{section}]")
         choices = f" One of {', '.join(f.choices)}." if f.choices else ""
-        text = f"{f.help}{choices} (default {f.default})"
+        text = f"{f.help}{choices} (default {f.value})"
         group.add_argument(f"--{f.name.replace('_', '-')}", metavar="VALUE", help=text.replace("%", "%%"))
     parser.print_help()

@@ -202,8 +202,13 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
+<<<<<<< HEAD
     def correction(self) -> Literal["target", "jacobian"]:
         """How answers are corrected: see `inverse_kinematics.solve`."""
+=======
+    def slides(self) -> tuple[bool, ...]:
+        """Which of them are metres, since the joint slides, rather than radians."""
+>>>>>>> mend
         ...
 
     @property
@@ -235,7 +240,7 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     def joints(self, action: jax.Array) -> jax.Array:
-        """The joint positions that an action asks for, (dof,)."""
+        """The joint positions that an action asks for, (dof,), radians (metres for slides)."""
         ...
 
     def errors(self, achieved: Goal, goal: Goal) -> dict[str, jax.Array]:

@@ -13,7 +13,7 @@ import hashlib
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -33,8 +33,9 @@ class Checkpoints:
     """The checkpoints of one run, in one folder, numbered by the steps taken.
 
     `settings` are those that shape what is kept, by name: a checkpoint made with others is refused. Those of `budget`
-    may change, and `check` says which did. Only the process that trains the run may open them for writing: it clears
-    away what a killed one left unfinished.
+    may change, and `check` says which did. One of `left_open` that a record lacks is not compared: it is younger than
+    the run. Only the process that trains the run may open them for writing: it clears away what a killed one left
+    unfinished.
     """
 
     def __init__(
@@ -43,10 +44,12 @@ class Checkpoints:
         settings: Mapping[str, Any],
         budget: Mapping[str, Any] | None = None,
         read_only: bool = False,
+        left_open: Collection[str] = (),
     ) -> None:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
         self.folder = folder
+        self._left_open = left_open
         # As a record gives them back: JSON has no tuples.
         self._settings, self._budget = json.loads(json.dumps([dict(settings), dict(budget or {})]))
         logging.getLogger("absl").setLevel(logging.CRITICAL)
@@ -72,7 +75,8 @@ class Checkpoints:
         items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
         record = {name: _describe(leaves) for name, leaves in items.items()}
         record |= {"settings": self._settings, "budget": self._budget}
-        failure = f"cannot write a checkpoint to {self.folder}; the last complete one is kept, resume from that"
+        kept = "" if self.latest is None else ", the last complete one is kept"
+        failure = f"cannot write a checkpoint to {self.folder}{kept}"
         with _as_user_error(failure):
             self._manager.save(
                 int(training.steps),
@@ -95,9 +99,9 @@ class Checkpoints:
     def check(self) -> dict[str, tuple[Any, Any]]:
         """Raise `UserError` if the newest checkpoint, where there is one, was made with other settings or is damaged.
         Returns what of the budget has changed since: from what to what, by name."""
-        before = {} if self.latest is None else self._record(self.latest).get("budget", {})
-        now = self._budget
-        return {name: (before[name], now[name]) for name in before if name in now and before[name] != now[name]}
+        record = {} if self.latest is None else self._record(self.latest)
+        before = {**record.get("settings", {}), **record.get("budget", {})}
+        return {name: (before[name], v) for name, v in self._budget.items() if name in before and before[name] != v}
 
     def _read(self, item: str, like: T) -> T:
         import orbax.checkpoint as ocp
@@ -132,8 +136,9 @@ class Checkpoints:
             made_with = record.get("settings")
         if made_with is None:
             raise UserError(f"the checkpoint {where} is of an older version: train the run anew")
-        names = [*made_with, *(name for name in self._settings if name not in made_with)]
-        if changed := [name for name in names if made_with.get(name) != self._settings.get(name)]:
+        names = [*made_with, *(name for name in self._settings if name not in {*made_with, *self._left_open})]
+        fixed = [name for name in names if name not in self._budget]
+        if changed := [name for name in fixed if made_with.get(name) != self._settings.get(name)]:
             told = "; ".join(f"{n} = {made_with.get(n)!r}, now {self._settings.get(n)!r}" for n in changed[:3])
             raise UserError(
                 f"the checkpoint {where} was made with other settings ({told}): set them back in config.toml"

@@ -12,6 +12,7 @@ import sys
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,7 +81,7 @@ class Field(NamedTuple):
 
     section: str
     name: str
-    default: Any
+    value: Any
     help: str
     choices: list[str] | None
 
@@ -93,7 +94,8 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     Args:
         experiment: A TOML file, or the name of one that ships.
         overrides: Values by name: `batch_size=128`, or with its section where a name is not unique:
-            `**{"ddpg.batch_size": 128}`. Text is read as on a command line.
+            `**{"ddpg.batch_size": 128}`. Text is read as on a command line, a tuple as
+            `mark="0.1, 0.2"`.
 
     Raises:
         UserError: There is no such file or setting, or a value is not of its type and range.
@@ -104,30 +106,34 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     (100, 'kinematic')
     >>> load_config(batch_sise=3)
     Traceback (most recent call last):
-    arm5dof.errors.UserError: unknown setting 'batch_sise': did you mean 'batch_size'?
+    arm5dof.training.config.UnknownSettingError: unknown setting 'batch_sise': did you mean 'batch_size'?
     """
     path = files.find("experiments", experiment)
     if path is None:
         names = ", ".join(files.shipped("experiments", ".toml"))
         raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
-    values = _read(path)
-    config = build(values, str(path), path.parent)  # A fault of the file is not to be blamed on the overrides.
-    if not overrides:
-        return config
-    known = fields(config.task)
-    for name, value in overrides.items():
+    return override(build(_read(path), str(path), path.parent, fill=True), overrides)
+
+
+def override(config: Config, values: Mapping[str, Any]) -> Config:
+    """A configuration with other values of some settings, by name, as `load_config` takes them."""
+    known, given = fields(config), dict[str, dict[str, Any]]()
+    for name, value in values.items():
         found = find(name, known)
-        values.setdefault(found.section, {})[found.name] = _parse(value, found.default)
-    return build(values, "", path.parent)
+        given.setdefault(found.section, {})[found.name] = _parse(value, found.value)
+    now = {section: getattr(config, section) for section in given}
+    changed = {name: _section(name, type(now[name]), {**vars(now[name]), **given[name]}) for name in given}
+    return dataclasses.replace(config, **changed)
 
 
-def build(values: Mapping[str, Any], source: str = "", folder: Path | None = None) -> Config:
+def build(values: Mapping[str, Any], source: str = "", folder: Path | None = None, fill: bool = False) -> Config:
     """A configuration from nested settings, as TOML has them.
 
     Args:
         values: Settings by section and name; `values["env"]["task"]` is the task.
         source: Where they are from, for errors.
         folder: Where a user's own task may be imported from, besides the usual places.
+        fill: Take what they leave open from the TOML file of a task that ships, rather than from the sections' classes.
 
     Raises:
         UserError: The first fault, and for an unknown key the nearest valid one.
@@ -135,12 +141,15 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
     try:
         for section, given in values.items():
             if section not in SECTIONS:
-                raise UserError(f"unknown section {section!r}: {nearest_hint(section, SECTIONS)}")
+                raise UserError(f"unknown section {section!r}: {_hint(section, SECTIONS)}")
             if not isinstance(given, Mapping):
                 raise UserError(f"{section} = {given!r}: it should be a section [{section}]")
         task = values.get("env", {}).get("task", "reach")
-        classes = section_classes(task, folder)
-        merged = {section: {**_task_defaults(task).get(section, {}), **values.get(section, {})} for section in SECTIONS}
+        classes = {"env": task_class(task, folder).Config, "ddpg": DDPGConfig, "train": TrainConfig}
+        classes["evaluate"] = EvaluateConfig
+        path = files.shipped_file("experiments", f"{task}.toml") if fill and ":" not in task else None
+        shipped = {} if path is None else _read(path)
+        merged = {section: {**shipped.get(section, {}), **values.get(section, {})} for section in SECTIONS}
         merged["env"].pop("task", None)
         return Config(task, **{name: _section(name, classes[name], merged[name]) for name in SECTIONS})
     except UserError as error:
@@ -151,12 +160,6 @@ def dumps(config: Config) -> str:
     """The configuration as TOML, every field spelled out."""
     sections = {name: dataclasses.asdict(getattr(config, name)) for name in SECTIONS}
     return tomli_w.dumps({**sections, "env": {"task": config.task, **sections["env"]}})
-
-
-def section_classes(task: str, folder: Path | None = None) -> dict[str, type]:
-    """The classes of a configuration's sections."""
-    own = task_class(task, folder).Config
-    return {"env": own, "ddpg": DDPGConfig, "train": TrainConfig, "evaluate": EvaluateConfig}
 
 
 def task_class(task: str, folder: Path | None = None) -> type[Task]:
@@ -181,6 +184,8 @@ def task_class(task: str, folder: Path | None = None) -> type[Task]:
         raise UserError(
             f"cannot import task {task!r} ({reason}): put its folder on PYTHONPATH, or start from there"
         ) from error
+    if folder is not None and not shipped:
+        _check_origin(module.partition(".")[0], folder)
     is_task = isinstance(found, type) and issubclass(found, Task)
     if not is_task or not dataclasses.is_dataclass(getattr(found, "Config", None)):
         raise UserError(f"{task!r} is no task: it takes a class that inherits from arm5dof.Task and has a Config")
@@ -211,44 +216,50 @@ def make_env(config: Config, mj_model: mujoco.MjModel | None = None) -> Task:
     return cls(config.env) if mj_model is None else cls(config.env, mj_model)
 
 
-def fields(task: str = "reach", folder: Path | None = None) -> list[Field]:
-    """Every setting with its documentation, in the order of declaration; defaults are the task's."""
-    defaults = build({"env": {"task": task}}, folder=folder)
+def fields(config: Config) -> list[Field]:
+    """Every setting of a configuration with its documentation, in the order of declaration."""
     return [
-        Field(section, name, getattr(getattr(defaults, section), name), *described)
-        for section, cls in section_classes(task, folder).items()
-        for name, described in _descriptions(cls).items()
+        Field(section, name, getattr(settings, name), *described)
+        for section, settings in ((section, getattr(config, section)) for section in SECTIONS)
+        for name, described in _descriptions(settings.__class__).items()
     ]
 
 
 def find(name: str, known: list[Field]) -> Field:
-    """The setting of a name, `batch_size` or `ddpg.batch_size`. Raises `UserError` naming the nearest one if there is
-    none, or the full names if there are several."""
+    """The setting of a name, `batch_size` or `ddpg.batch_size`.
+
+    Raises:
+        UnknownSettingError: There is none.
+        UserError: There are several: it gives their full names.
+    """
     wanted = name.replace("-", "_")
     matching = [f for f in known if wanted in (f.name, f"{f.section}.{f.name}")]
     if len(matching) > 1:
         raise UserError(f"{name!r} is {' or '.join(f'{f.section}.{f.name}' for f in matching)}: name the section too")
     if not matching:
         names = [key for f in known for key in (f.name, f"{f.section}.{f.name}")]
-        raise UserError(f"unknown setting {name!r}: {nearest_hint(wanted, names, 'see arm5dof train --help')}")
+        raise UnknownSettingError(name, _nearest(wanted, names))
     return matching[0]
+
+
+class UnknownSettingError(UserError):
+    """No setting has that name; `nearest` is the valid one that is most like it, if any is."""
+
+    def __init__(self, name: str, nearest: str | None) -> None:
+        hint = f"did you mean {nearest!r}?" if nearest else "`Config.flat()` lists the valid ones"
+        super().__init__(f"unknown setting {name!r}: {hint}")
+        self.name, self.nearest = name, nearest
 
 
 def _section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
     names = [f.name for f in dataclasses.fields(cls)]
     for key in values:
         if key not in names:
-            raise UserError(f"unknown key '{name}.{key}': {nearest_hint(key, names)}")
+            raise UserError(f"unknown key '{name}.{key}': {_hint(key, names)}")
     try:
         return cls(**values)
     except UserError as error:
         raise UserError(f"{name}.{error}") from None
-
-
-def _task_defaults(task: str) -> dict[str, Any]:
-    """What the TOML file of a task that ships says."""
-    path = files.shipped_file("experiments", f"{task}.toml") if ":" not in task else None
-    return {} if path is None else _read(path)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -267,6 +278,15 @@ def _import(module: str, folder: Path | None) -> Any:
     return importlib.import_module(module)
 
 
+def _check_origin(module: str, folder: Path) -> None:
+    """Raise `UserError` if a folder has an imported module of its own that is not the one imported."""
+    own, used = PathFinder.find_spec(module, [str(folder)]), getattr(sys.modules[module], "__file__", None)
+    if own and own.has_location and Path(str(used)).resolve() != Path(str(own.origin)).resolve():
+        raise UserError(
+            f"module {module!r} is {used} here and not {own.origin}: rename one of them, or use a process for each"
+        )
+
+
 @functools.cache
 def _descriptions(cls: type) -> dict[str, tuple[str, list[str] | None]]:
     """What is said of each field, and its choices if it has some."""
@@ -281,9 +301,14 @@ def _descriptions(cls: type) -> dict[str, tuple[str, list[str] | None]]:
 
 
 def _parse(value: Any, default: Any) -> Any:
-    """A command line's text as the value that it spells; what is no text, or is to be some, stays."""
+    """A command line's text as the value that it spells, `0.1, 0.2` for a tuple; what is no text, or is to be some,
+    stays."""
     if not isinstance(value, str) or isinstance(default, str):
         return value
+    if isinstance(default, tuple):
+        parts = value.strip("()[] ").removesuffix(",").split(",")
+        examples = [*default, *default[-1:] * len(parts)] or [None] * len(parts)
+        return tuple(_parse(part.strip(), example) for part, example in zip(parts, examples, strict=False))
     if isinstance(default, bool):
         return {"true": True, "false": False}.get(value.lower(), value)
     for number in (int, float):
@@ -292,12 +317,12 @@ def _parse(value: Any, default: Any) -> Any:
     return value
 
 
-def nearest_hint(name: str, valid: Iterable[str], otherwise: str | None = None) -> str:
+def _hint(name: str, valid: Iterable[str]) -> str:
     """What to say of a name that is none of the valid ones."""
-    near = nearest(name, valid)
-    return f"did you mean {near!r}?" if near else otherwise or f"valid are {', '.join(valid)}"
+    near = _nearest(name, valid)
+    return f"did you mean {near!r}?" if near else f"valid are {', '.join(valid)}"
 
 
-def nearest(name: str, valid: Iterable[str]) -> str | None:
+def _nearest(name: str, valid: Iterable[str]) -> str | None:
     """The valid name that is most like another, if any is."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)

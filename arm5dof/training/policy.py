@@ -80,8 +80,8 @@ class Policy(struct.PyTreeNode, eq=False):
         """Inverse kinematics: ask for joint positions that lead to goals, from the arm's home pose.
 
         Args:
-            target: The first of the task's goal inputs, which for the tasks that ship is a point (3,), metres, or
-                several, (n, 3).
+            target: The first of the task's goal inputs, which for the tasks that ship is a point (3,), metres in the
+                world frame, or several, (n, 3).
             corrections: How often the policy is asked again for a goal shifted by the error it was seen to make
                 (closed-loop target correction). The best answer counts.
             candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the

@@ -45,12 +45,11 @@ def kept(folder: Path, version: str, digests: Mapping[str, str]) -> mujoco.MjMod
     if not digests:
         return None
     same = version == metadata.version("mujoco")
-    name = COMPILED if same else MJCF
-    path = folder / name
+    path = folder / (COMPILED if same else MJCF)
     unreadable = f"{folder} keeps its robot as MuJoCo {version} has it: install that version"
-    if name not in digests:
+    if not same and MJCF not in digests:
         raise UserError(unreadable)
-    if not path.is_file() or _digest(path) != digests[name]:
+    if not path.is_file() or _digest(path) != digests.get(path.name):
         raise UserError(f"{path}, the run's robot, is missing or damaged: take it from a copy of the run")
     if same:
         return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": gzip.decompress(path.read_bytes())})

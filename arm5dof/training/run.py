@@ -68,6 +68,8 @@ class Run:
 
     folder: Path
     config: Config
+    left_open: frozenset[str] = frozenset()
+    """Full names of settings that its `config.toml` leaves open: those that came with a later version."""
 
     @staticmethod
     def create(settings: Config, folder: str | Path, env: Task | None = None) -> Run:
@@ -93,7 +95,11 @@ class Run:
 
     @staticmethod
     def open(folder: str | Path) -> Run:
-        """A run that exists. Raises `UserError` if the folder is none, or its task cannot be imported."""
+        """A run that exists. What its `config.toml` leaves open is as the settings' classes have it.
+
+        Raises:
+            UserError: The folder is no run, or its task cannot be imported.
+        """
         folder = Path(folder)
         path = folder / "config.toml"
         if not path.is_file() or not (folder / "run.json").is_file():
@@ -104,24 +110,35 @@ class Run:
             values = tomllib.loads(path.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"{path} is not valid TOML: {error}") from None
-        return Run(folder, config.build(values, str(path)))
+        settings = config.build(values, str(path))
+        stated = {f"{section}.{name}" for section, given in values.items() for name in given}
+        return Run(folder, settings, frozenset(settings.flat().keys() - stated))
 
     @cached_property
     def env(self) -> Task:
         """The environment, with the robot that the run was made for, whatever happened to its MJCF since."""
-        with _undamaged(self.folder / "run.json"):
-            record = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))
+        path = self.folder / "run.json"
+        with _undamaged(path):
+            record = json.loads(path.read_text(encoding="utf-8"))
             version, digests = str(record["versions"]["mujoco"]), dict(record["model"])
-        return make_env(self.config, robot.kept(self.folder, version, digests))
+        env = make_env(self.config, robot.kept(self.folder, version, digests))
+        if env.mj_model is not None and not digests:
+            raise UserError(f"{path} is damaged (it names no robot): take it from a copy of the run")
+        return env
 
     def trainer(self) -> Trainer:
         """The run's training program."""
         return Trainer(self.env, self.config)
 
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is one to answer with and to go on from."""
+        return any(path.name.isdigit() for path in (self.folder / "checkpoints").glob("*"))
+
     def policy(self) -> Policy:
         """The policy of the newest checkpoint. Raises `UserError` if there is none, or it was made with other
         settings."""
-        if not (self.folder / "checkpoints").is_dir():
+        if not self.has_checkpoint:
             raise UserError(f"{self.folder} has no checkpoint yet: resume it")
         checkpoints = self._checkpoints(read_only=True)
         checkpoints.check()
@@ -148,7 +165,7 @@ class Run:
 
     def _checkpoints(self, read_only: bool = False) -> Checkpoints:
         fixed, budget = config.fixed(self.config), config.may_change(self.config)
-        return Checkpoints(self.folder / "checkpoints", fixed, budget, read_only)
+        return Checkpoints(self.folder / "checkpoints", fixed, budget, read_only, self.left_open)
 
     @contextmanager
     def locked(self) -> Iterator[None]:

@@ -102,18 +102,11 @@ class Letterbox:
     offset: tuple[int, int]
     """Where it begins in this one: left, top."""
 
-    def from_source(self, xyxy: np.ndarray) -> np.ndarray:
-        """Boxes in the source image, where they are in this one."""
-        return np.asarray(xyxy, float) * np.tile(self._scale, 2) + np.tile(self.offset, 2)
-
     def to_source(self, xyxy: np.ndarray) -> np.ndarray:
         """Boxes in this image, where they are in the source, clipped to its edges."""
-        boxes = (np.asarray(xyxy, float) - np.tile(self.offset, 2)) / np.tile(self._scale, 2)
+        scale = np.array(self.inner) / np.array(self.source)
+        boxes = (np.asarray(xyxy, float) - np.tile(self.offset, 2)) / np.tile(scale, 2)
         return np.clip(boxes, 0, np.tile(self.source, 2))
-
-    @property
-    def _scale(self) -> np.ndarray:
-        return np.array(self.inner) / np.array(self.source)
 
 
 def letterbox(image: np.ndarray, size: tuple[int, int], stride: int | None = None) -> Letterbox:

@@ -88,5 +88,3 @@ CATALOGUE = (
 """A detection's class id is an index into it."""
 
 CLASS_NAMES = tuple(one.name for one in CATALOGUE)
-HALF_HEIGHTS = {one.name: one.half_height for one in CATALOGUE}
-"""Height of an object's center above the table, metres, by the name of its class."""

@@ -16,13 +16,14 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from helpers.serial import serial_arm
 
 from arm5dof.arm import load_arm
 from arm5dof.cli import main as cli
 from arm5dof.errors import UserError
 from arm5dof.training import checkpoint
 from arm5dof.training.checkpoint import Checkpoints
-from arm5dof.training.config import fixed
+from arm5dof.training.config import fixed, load_config
 from arm5dof.training.run import Run, free_folder
 
 TINY = (
@@ -135,6 +136,43 @@ def test_solve_takes_and_gives_csv(trained, tmp_path):
         assert miss == pytest.approx(float(row["error_mm"]), abs=1e-3)
 
 
+def test_slides_are_metres_for_programs_and_millimetres_for_people(tmp_path, capsys):
+    spec = serial_arm(4, seed=2, slides=True)
+    (tmp_path / "slides.xml").write_text(spec.to_xml())
+    small = {"actor_width": 16, "actor_depth": 1, "critic_width": 8, "critic_depth": 1, "replay_capacity": 64}
+    created = Run.create(load_config("kinematic.toml", arm=str(tmp_path / "slides.xml"), **small), tmp_path / "run")
+    trainer = created.trainer()
+    trainer.state = trainer._init(created.config.ddpg, jax.random.key(0))
+    created._checkpoints().save(trainer.state)
+    arm = created.env.arm
+    hinges = [name for name, slides in zip(arm.joint_names, arm.slides, strict=True) if not slides]
+    slides = [name for name in arm.joint_names if name not in hinges]
+    assert hinges and slides and arm.joint_names != (*hinges, *slides)
+
+    asked = ("--target", 0.1, 0.2, 0.3, "--tolerance-mm", 1e6, "--refine", 0)
+    (tmp_path / "in.csv").write_text("x,y,z\n0.1,0.2,0.3\n")
+    capsys.readouterr()
+    assert run("solve", tmp_path / "run", *asked, "--json") == 0
+    (answer,) = json.loads(capsys.readouterr().out)
+    assert (list(answer["joints_rad"]), list(answer["joints_m"])) == (hinges, slides)
+    joints = answer["joints_rad"] | answer["joints_m"]
+    data = mujoco.MjData(arm.mj_model)
+    for name, value in joints.items():
+        data.joint(name).qpos = value
+    mujoco.mj_kinematics(data.model, data)
+    assert 1e3 * np.linalg.norm(data.site("ee").xpos - [0.1, 0.2, 0.3]) == pytest.approx(answer["error_mm"], abs=1e-2)
+
+    assert run("solve", tmp_path / "run", "--csv", tmp_path / "in.csv", *asked[4:]) == 0
+    (row,) = csv.DictReader(capsys.readouterr().out.splitlines())
+    assert list(row) == ["x", "y", "z", *arm.joint_names, "error_mm", "reached"]
+    assert {name: float(row[name]) for name in joints} == pytest.approx(joints, abs=1e-7)
+
+    assert run("solve", tmp_path / "run", *asked) == 0
+    angles = "  ".join(f"{name} {np.degrees(joints[name]):.2f}" for name in hinges)
+    shifts = "  ".join(f"{name} {1e3 * joints[name]:.2f}" for name in slides)
+    assert f":  {angles} degrees  {shifts} mm  error " in capsys.readouterr().out
+
+
 def test_solve_refuses_bad_targets(trained, tmp_path, fails):
     before = digest(trained)
     assert "not finite" in fails("solve", trained, "--target", "nan", 0, 0)
@@ -167,6 +205,7 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
     ("arguments", "said"),
     [
         (["--batch-sise", "3"], "did you mean --batch-size?"),
+        (["--zzz"], "unknown option --zzz: see arm5dof train --help"),
         (["--batch-size", "many"], "valid integer"),
         (["--batch-size"], "needs a value"),
         (["--discount", "1.5"], "less than or equal to 1"),
@@ -338,6 +377,23 @@ sys.exit(main(sys.argv[1:]))
     assert json.loads((folder / "evaluations.json").read_text())[-1]["episodes"] == 4
 
 
+@pytest.mark.parametrize("saved", [0, 1])
+def test_how_to_go_on_is_said_where_there_is_something_to_go_on_from(saved, fails, tmp_path, monkeypatch):
+    save, calls = Checkpoints.save, []
+
+    def limited(self, training):
+        calls.append(self)
+        if len(calls) > saved:
+            raise UserError("no more")
+        save(self, training)
+
+    monkeypatch.setattr(Checkpoints, "save", limited)
+    said = fails("train", *TINY.split(), "--out", tmp_path / "run")
+    assert said == "arm5dof: no more" + f"; go on with arm5dof train --resume {tmp_path / 'run'}" * saved
+    assert Run.open(tmp_path / "run").has_checkpoint == bool(saved)
+    assert saved or "no checkpoint yet" in fails("eval", tmp_path / "run")
+
+
 def test_failures_that_nobody_waits_for_are_silent(caplog, capfd):
     """After a first write has failed, tensorstore's others may or may not fail in time for someone to ask."""
 
@@ -362,6 +418,9 @@ def test_help_lists_every_setting(capsys):
     assert caught.value.code == 0
     text = capsys.readouterr().out
     assert "--resume" in text and "--actor-lr" in text and "--substeps" in text
+    with pytest.raises(SystemExit):
+        run("train", "kinematic.toml", "--help")
+    assert "(default kinematic)" in " ".join(capsys.readouterr().out.split()), "as the experiment has it"
     assert run() == 0 and "COMMAND" in capsys.readouterr().out
 
 

@@ -1,5 +1,6 @@
 """A task of one's own: what it inherits, and that one file and one TOML outside the package are all it takes."""
 
+import ast
 import importlib.util
 import json
 import os
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tomli_w
+from helpers.errors import said
 
 from arm5dof.envs import State, Task, VectorEnv
 from arm5dof.envs.base import episode_returns
@@ -248,6 +250,10 @@ def test_settings_of_all_sorts_survive_a_run(tmp_path: Path, monkeypatch: pytest
         "[evaluate]\ntargets = 20\ninterim_targets = 20\n"
     )
     config = load_config("marksman.toml")
+    for text in ("0.1,-0.5", "-.5, 1e-1", "(0.1, -0.5)", "[0.1, -0.5,]", "0, 1"):
+        assert load_config("marksman.toml", mark=text).env.mark == ast.literal_eval(f"({text.strip('([,])')})")
+    for wrong in ("0.1", "0.1,x", "0.1,0.2,0.3", "", "0.1 0.2"):
+        assert said(lambda wrong=wrong: load_config("marksman.toml", mark=wrong)).startswith("env.mark")
     assert config.env.mark == (0.0, 0.75) and make_env(config).config is config.env
     run = train(config, "runs/marksman")
     opened = Run.open("runs/marksman")
@@ -255,6 +261,21 @@ def test_settings_of_all_sorts_survive_a_run(tmp_path: Path, monkeypatch: pytest
     actions = opened.policy()({"state": np.zeros((3, 1)), "privileged_state": np.zeros((3, 1))})
     assert actions.shape == (3, 2)
     assert {e["return"]["max"] <= 0 for e in run.evaluations} == {True}
+
+
+def test_modules_of_one_name_in_two_folders_are_not_mistaken_for_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for folder in (tmp_path / "mine", tmp_path / "theirs"):
+        folder.mkdir()
+        (folder / "archer.py").write_text(MARKSMAN)
+        (folder / "archer.toml").write_text('[env]\ntask = "archer:Marksman"\n')
+    (tmp_path / "archer.toml").write_text('[env]\ntask = "archer:Marksman"\n')
+    mine = load_config(tmp_path / "mine/archer.toml")
+    assert load_config(tmp_path / "mine/archer.toml") == mine == load_config(tmp_path / "archer.toml")
+    text = said(lambda: load_config(tmp_path / "theirs/archer.toml"))
+    assert f"'archer' is {tmp_path}/mine/archer.py here and not {tmp_path}/theirs/archer.py: rename one" in text
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -18,6 +18,8 @@ import pytest
 import tomli_w
 from helpers.errors import said
 
+from arm5dof.ddpg import DDPGConfig
+from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.runtime import files
 from arm5dof.training import config, evaluate
 from arm5dof.training.checkpoint import Checkpoints
@@ -145,7 +147,7 @@ def test_half_a_run_goes_on_to_the_same_end_anywhere(runs: dict[str, Path], else
 
 MAY_CHANGE = {
     *("train.episodes", "train.evaluate_every", "train.checkpoint_every"),
-    *("evaluate.targets", "evaluate.interim_targets"),
+    *("evaluate.targets", "evaluate.interim_targets", "env.branches", "env.refinements"),
 }
 
 
@@ -177,8 +179,8 @@ def edit(folder: Path, **changes: object) -> Run:
 def test_every_edited_setting_is_refused_by_name_or_may_change(runs: dict[str, Path], elsewhere: Path):
     folder = copy(runs["half"], elsewhere / "edited")
     text = (folder / "config.toml").read_text()
-    now = Run.open(folder).config.flat()
-    known = [(f"{f.section}.{f.name}", f) for f in config.fields(now["env.task"])]
+    settings = Run.open(folder).config
+    now, known = settings.flat(), [(f"{f.section}.{f.name}", f) for f in config.fields(settings)]
     assert {"env.task", *(name for name, _ in known)} == now.keys() > MAY_CHANGE
     for name, f in known:
         value = another(now[name], f.choices)
@@ -189,6 +191,61 @@ def test_every_edited_setting_is_refused_by_name_or_may_change(runs: dict[str, P
             continue
         for call in (run.policy, lambda run=run: resume(run), lambda run=run: run.evaluate(1)):
             assert f"({name} = {now[name]!r}, now {value!r})" in said(call), name
+
+
+def forget(folder: Path, name: str, record: bool) -> Run:
+    """Make a run one of a version that did not have a setting yet, or let its config.toml alone lack it."""
+    path, (section, _, key) = folder / "config.toml", name.partition(".")
+    values = tomllib.loads(path.read_text())
+    del values[section][key]
+    path.write_text(tomli_w.dumps(values))
+    for path in folder.glob("checkpoints/*/record/metadata") if record else ():
+        kept = json.loads(path.read_text())
+        del kept["settings"][name]
+        path.write_text(json.dumps(kept))
+    return Run.open(folder)
+
+
+def test_runs_of_a_version_without_a_setting_answer_and_go_on(runs: dict[str, Path], elsewhere: Path):
+    run = forget(copy(runs["half"], elsewhere / "half"), "ddpg.actor_products", record=True)
+    assert run.left_open == {"ddpg.actor_products"} and not run.config.ddpg.actor_products
+    assert resume(run).evaluations == Run.open(runs["finished"]).evaluations
+    np.testing.assert_array_equal(run.policy().solve(GOALS, corrections=2).q, np.load(runs["answers.npy"]))
+    other = forget(copy(runs["half"], elsewhere / "other"), "ddpg.heads", record=True)
+    assert "does not fit the run's config.toml" in said(other.policy), "networks show how many heads they have"
+
+
+def test_a_setting_that_only_one_of_configuration_and_checkpoint_has_is_compared(
+    runs: dict[str, Path], elsewhere: Path
+):
+    name = "ddpg.random_action_prob"
+    run = forget(copy(runs["finished"], elsewhere / "lost"), name, record=False)
+    assert f"({name} = 1.0, now {run.config.ddpg.random_action_prob!r})" in said(run.policy)
+    folder = forget(copy(runs["finished"], elsewhere / "added"), name, record=True).folder
+    text = (folder / "config.toml").read_text()
+    (folder / "config.toml").write_text(text.replace("[ddpg]\n", "[ddpg]\nrandom_action_prob = 0.5\n"))
+    assert f"({name} = None, now 0.5)" in said(Run.open(folder).policy)
+
+
+def test_a_setting_of_which_an_older_version_did_not_know_that_it_may_change(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["half"], elsewhere / "half")
+    for path in folder.glob("checkpoints/*/record/metadata"):
+        kept = json.loads(path.read_text())
+        kept["settings"]["env.branches"] = kept["budget"].pop("env.branches")
+        path.write_text(json.dumps(kept))
+    assert Run.open(folder).policy().solve(GOALS).q.shape == (3, 5)
+    assert edit(folder, **{"env.branches": 2})._checkpoints(read_only=True).check() == {"env.branches": (1, 2)}
+
+
+def test_a_run_does_not_change_with_the_tasks_toml(tmp_path: Path):
+    """What a run's config.toml lacks is as the classes have it, whatever the TOML file says today."""
+    shipped = load_config("reach_pose.toml")
+    run = Run.create(shipped, tmp_path / "run")
+    assert Run.open(run.folder).config == shipped and not Run.open(run.folder).left_open
+    (run.folder / "config.toml").write_text('[env]\ntask = "reach_pose"\n')
+    opened = Run.open(run.folder).config
+    assert (opened.env, opened.ddpg) == (ReachPoseConfig(), DDPGConfig())
+    assert opened.env.branches != shipped.env.branches and opened.ddpg.heads != shipped.ddpg.heads
 
 
 def test_budget_and_intervals_may_change_and_are_named(runs: dict[str, Path], elsewhere: Path):
@@ -253,6 +310,29 @@ def test_damaged_metrics_are_refused(runs: dict[str, Path], elsewhere: Path):
     (folder / "metrics.csv").write_text(text.replace("\n8,", "\neight,"))
     for call in (lambda: Run.open(folder).metrics, lambda: resume(Run.open(folder))):
         assert "metrics.csv is damaged" in said(call)
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_run_that_names_no_robot_does_not_fall_back_to_the_arms_own_file(
+    runs: dict[str, Path], elsewhere: Path, gone: bool
+):
+    """`elsewhere` has another arm in a file of the name that the run's settings give."""
+    folder = copy(runs["finished"], elsewhere / "run")
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**record, "model": {}}))
+    if gone:
+        for name in record["model"]:
+            (folder / name).unlink()
+    for call in (Run.open(folder).policy, lambda: resume(Run.open(folder)), lambda: Run.open(folder).env):
+        assert said(call).endswith("run.json is damaged (it names no robot): take it from a copy of the run")
+
+
+def test_a_record_without_the_compiled_robot_is_refused(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["finished"], elsewhere / "run")
+    record = json.loads((folder / "run.json").read_text())
+    del record["model"]["model.mjb.gz"]
+    (folder / "run.json").write_text(json.dumps(record))
+    assert "model.mjb.gz, the run's robot, is missing or damaged" in said(Run.open(folder).policy)
 
 
 def of_another_version(folder: Path) -> dict:

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import options
 
 if TYPE_CHECKING:
@@ -34,10 +35,7 @@ photographs are too few, show another board, or leave the intrinsics uncertain.
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `calibrate` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(
-        "calibrate", help="calibrate a camera from photographs", description=HELP, formatter_class=raw
-    )
+    p = commands.add_parser("calibrate", help="calibrate a camera from photographs", description=HELP)
     p.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="photographs, or folders of them")
     options.add_board(p)
     p.add_argument(
@@ -55,7 +53,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision calibrate`."""
-    options.nothing_left(rest, "calibrate")
+    nothing_left(rest, "vision calibrate")
     options.writable(args.out, (".yml", ".yaml"))
     if args.preview is not None:
         options.writable(args.preview, (".png", ".jpg"))

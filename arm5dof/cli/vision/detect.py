@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import detecting, options
+from arm5dof.cli.parser import nothing_left
+from arm5dof.cli.vision import detecting
 
 if TYPE_CHECKING:
     from arm5dof.vision.io.sinks import Write
@@ -47,8 +48,7 @@ the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so 
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `detect` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("detect", help="find objects in images", description=HELP, formatter_class=raw)
+    p = commands.add_parser("detect", help="find objects in images", description=HELP)
     p.add_argument("source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, or simulated")
     detecting.add_options(p)
     p.add_argument("--json", action="store_true", help="print what goes into detections.json, frame by frame")
@@ -57,7 +57,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> int:
     """`arm5dof vision detect`."""
-    options.nothing_left(rest, "detect")
+    nothing_left(rest, "vision detect")
 
     from arm5dof.vision.io.sources import open_source
 

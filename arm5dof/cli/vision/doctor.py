@@ -10,7 +10,7 @@ import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.parser import nothing_left
 
 if TYPE_CHECKING:
     from arm5dof.vision.evaluation.doctor import Finding
@@ -25,15 +25,14 @@ Nothing needs OpenGL. Software renders the same, more slowly, and is used where 
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `doctor` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("doctor", help="what works on this machine", description=HELP, formatter_class=raw)
+    p = commands.add_parser("doctor", help="what works on this machine", description=HELP)
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision doctor`."""
-    options.nothing_left(rest, "doctor")
+    nothing_left(rest, "vision doctor")
     broken = _broken_choice()
 
     from arm5dof.vision.evaluation import doctor

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ Scenes are rendered with OpenGL where that works (see arm5dof vision doctor), ot
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `eval` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("eval", help="measure the detector that ships", description=HELP, formatter_class=raw)
+    p = commands.add_parser("eval", help="measure the detector that ships", description=HELP)
     p.add_argument("--weights", type=Path, metavar="FILE", help="what arm5dof vision train wrote; default: what ships")
     p.add_argument("--scenes", type=int, default=1000, metavar="N", help="default 1000")
     p.add_argument("--seed", type=int, default=1, metavar="S", help="of the scenes; default 1")
@@ -44,7 +43,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision eval`."""
-    options.nothing_left(rest, "eval")
+    nothing_left(rest, "vision eval")
     for name, least in (("scenes", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise UserError(f"--{name} is {least} or more, not {getattr(args, name)}")

@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
 
 HELP = """\
@@ -33,10 +34,7 @@ hand's frame: arm5dof vision locate takes the hand's pose with it.
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `hand-eye` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(
-        "hand-eye", help="find where a camera stands by moving the hand", description=HELP, formatter_class=raw
-    )
+    p = commands.add_parser("hand-eye", help="find where a camera stands by moving the hand", description=HELP)
     p.add_argument("camera", type=Path, metavar="CAMERA.yml", help="the calibrated camera")
     p.add_argument("poses", type=Path, metavar="POSES.csv", help="photographs and the hand's poses")
     where = p.add_mutually_exclusive_group(required=True)
@@ -50,7 +48,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision hand-eye`."""
-    options.nothing_left(rest, "hand-eye")
+    nothing_left(rest, "vision hand-eye")
     options.writable(args.out, (".yml", ".yaml"))
 
     from arm5dof.runtime.progress import late_bar

@@ -12,7 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import detecting, options
+from arm5dof.cli.parser import nothing_left
+from arm5dof.cli.vision import detecting
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
@@ -67,8 +68,7 @@ frames before, as with vision detect.
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `locate` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("locate", help="tell where objects are", description=HELP, formatter_class=raw)
+    p = commands.add_parser("locate", help="tell where objects are", description=HELP)
     p.add_argument(
         "source", nargs="+", metavar="SOURCE", help="photographs, folders, a video, a camera, simulated; or JSON"
     )
@@ -116,7 +116,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> int:
     """`arm5dof vision locate`."""
-    options.nothing_left(rest, "locate")
+    nothing_left(rest, "vision locate")
     if not math.isfinite(args.table):
         raise UserError(f"--table takes a height in metres, not {args.table:g}")
     if not 0 <= args.depth_error < math.inf:

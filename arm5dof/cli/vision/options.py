@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,12 +48,6 @@ def board_remedy() -> Iterator[None]:
         if error.size is None:
             raise
         raise UserError(f"{error}: give --board {error.size}") from None
-
-
-def nothing_left(rest: Sequence[str], command: str) -> None:
-    """Raise `UserError` if the command line has more than the command knows."""
-    if rest:
-        raise UserError(f"unexpected argument {rest[0]!r} (see arm5dof vision {command} --help)")
 
 
 def writable(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
 from arm5dof.errors import UserError
 
@@ -36,8 +37,7 @@ The pose goes into a new file beside the intrinsics, with the covariance of both
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `pose` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("pose", help="find where a camera stands", description=HELP, formatter_class=raw)
+    p = commands.add_parser("pose", help="find where a camera stands", description=HELP)
     p.add_argument("camera", type=Path, metavar="CAMERA.yml", help="the calibrated camera")
     p.add_argument("image", type=Path, metavar="IMAGE", help="a photograph of the board")
     options.add_board(p)
@@ -57,7 +57,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision pose`."""
-    options.nothing_left(rest, "pose")
+    nothing_left(rest, "vision pose")
     options.writable(args.out, (".yml", ".yaml"))
     board_to_base, placement_std = _at(args.at), _placed(args.placed)
 

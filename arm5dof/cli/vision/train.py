@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.cli.vision import options
+from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,8 +39,7 @@ BARS = {
 
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `train` to the vision commands."""
-    raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser("train", help="train the detector that ships", description=HELP, formatter_class=raw)
+    p = commands.add_parser("train", help="train the detector that ships", description=HELP)
     p.add_argument("--out", type=Path, default=Path("runs/detector"), metavar="FOLDER", help="default: runs/detector")
     p.add_argument("--seed", type=int, metavar="S", help="of all random numbers; default 0")
     p.add_argument("--scenes", type=int, metavar="N", help="images to render; default 3500")
@@ -51,7 +50,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof vision train`."""
-    options.nothing_left(rest, "train")
+    nothing_left(rest, "vision train")
     if args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
 

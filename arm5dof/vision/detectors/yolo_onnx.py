@@ -97,7 +97,7 @@ class OnnxYOLO:
         self._confidence, self._iou = confidence, iou
         self._path = Path(path)
         description = onnx_file.describe(self._path)
-        self._class_names = _names(self._path, class_names, description.metadata)
+        self.class_names = _names(self._path, class_names, description.metadata)
         self._size = _input_size(self._path, description, size)
         try:
             with quiet():
@@ -107,16 +107,11 @@ class OnnxYOLO:
             raise UserError(f"{path}: OpenCV cannot read this network ({_reason(error)}): export it anew") from None
         self._layout = self._recognize()
 
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """The classes, by their ids."""
-        return self._class_names
-
     def __call__(self, image: np.ndarray) -> Detections:
         """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
         boxed = letterbox(rgb(image), self._size)
         boxes, scores = self._layout.decode(self._forward(self._layout.blob(boxed.image)))
-        found = Detections.from_scores(boxes, scores, self._class_names, self._confidence, self._iou)
+        found = Detections.from_scores(boxes, scores, self.class_names, self._confidence, self._iou)
         return replace(found, xyxy=boxed.to_source(found.xyxy))
 
     def _forward(self, blob: np.ndarray) -> np.ndarray:
@@ -146,9 +141,9 @@ class OnnxYOLO:
                 f"{self._path}: an output of shape {output.shape} for {self._size[0]} x {self._size[1]} pixels is none "
                 "of YOLOv5's, v7's, v8's, v11's or YOLOX's: export it without non-maximum suppression, or give its size"
             )
-        if layout.classes != len(self._class_names):
+        if layout.classes != len(self.class_names):
             raise UserError(
-                f"{self._path} tells {layout.classes} classes apart, and {len(self._class_names)} names were given: "
+                f"{self._path} tells {layout.classes} classes apart, and {len(self.class_names)} names were given: "
                 "give one name for each class"
             )
         output = self._forward(layout.blob(grey))

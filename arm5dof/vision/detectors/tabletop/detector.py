@@ -59,14 +59,9 @@ class TabletopDetector:
         self, weights: str | Path | None = None, confidence: float = 0.25, iou: float = 0.6, tta: bool = False
     ) -> None:
         check_thresholds(confidence, iou)
-        params, self._class_names = load_weights(weights)
+        params, self.class_names = load_weights(weights)
         self._params = jax.device_put(params)
         self._confidence, self._iou, self._tta = confidence, iou, tta
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """The classes, by their ids."""
-        return self._class_names
 
     def __call__(self, image: np.ndarray) -> Detections:
         """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
@@ -85,7 +80,7 @@ class TabletopDetector:
             boxes, logits = (mirrored + again) / 2, (logits + mirrored_logits + again_logits) / 3
         rows = self._best(boxes, logits, objectness, self._confidence)
         scores = class_scores(logits[rows], objectness[rows])
-        return Detections(boxed.to_source(boxes[rows]), scores.max(1), scores.argmax(1), self._class_names)
+        return Detections(boxed.to_source(boxes[rows]), scores.max(1), scores.argmax(1), self.class_names)
 
     def _best(self, boxes: np.ndarray, logits: np.ndarray, objectness: np.ndarray, threshold: float) -> np.ndarray:
         """Rows of the boxes (n, 4) that score at least so much: the best wherever several overlap."""

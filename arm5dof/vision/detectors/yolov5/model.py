@@ -160,21 +160,16 @@ class YOLOv5:
                 f"{path} tells {len(names)} classes apart, and {len(class_names)} names were given: give one name for "
                 "each class"
             )
-        self._class_names = names if class_names is None else tuple(class_names)
+        self.class_names = names if class_names is None else tuple(class_names)
         self._stride = max(self._network.layers[-1].strides)
         check_size(size, self._stride)
         self._confidence, self._iou, self._size, self._square = confidence, iou, size, square
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """The classes, by their ids."""
-        return self._class_names
 
     def __call__(self, image: np.ndarray) -> Detections:
         """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
         boxed = letterbox(rgb(image), (self._size, self._size), None if self._square else self._stride)
         boxes, scores = (np.asarray(x) for x in self.forward(boxed.image))
-        found = Detections.from_scores(boxes, scores, self._class_names, self._confidence, self._iou)
+        found = Detections.from_scores(boxes, scores, self.class_names, self._confidence, self._iou)
         return replace(found, xyxy=boxed.to_source(found.xyxy))
 
     def forward(self, image: np.ndarray) -> tuple[jax.Array, jax.Array]:
