@@ -218,14 +218,13 @@ class ArmGoalEnv(Task):
         return self.arm.joint_names
 
     @property
-<<<<<<< HEAD
     def correction(self) -> Literal["target", "jacobian"]:
         """See `ForwardModel`."""
         return self.config.correction
-=======
+
+    @property
     def slides(self) -> tuple[bool, ...]:
         return self.arm.slides
->>>>>>> mend
 
     @property
     def branches(self) -> int:

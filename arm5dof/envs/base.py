@@ -202,13 +202,13 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
-<<<<<<< HEAD
     def correction(self) -> Literal["target", "jacobian"]:
         """How answers are corrected: see `inverse_kinematics.solve`."""
-=======
+        ...
+
+    @property
     def slides(self) -> tuple[bool, ...]:
         """Which of them are metres, since the joint slides, rather than radians."""
->>>>>>> mend
         ...
 
     @property

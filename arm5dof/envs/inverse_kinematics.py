@@ -46,19 +46,6 @@ def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> tu
     no Jacobian; "jacobian" takes steps of damped least squares within the joint limits, also from a few random poses
     (`env.restarts`).
     """
-<<<<<<< HEAD
-=======
-    if not corrections or env.branches == 1:
-        return _follow(env, act, goals, act.branch(jax.vmap(env.question)(goals)), corrections)[0]
-    branches = act.branches(jax.vmap(env.question)(goals))[:, : env.branches]
-    answers, rewards = jax.lax.map(lambda branch: _follow(env, act, goals, branch, corrections), branches.T)
-    best = rewards.argmax(0)
-    return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
-
-
-def _follow(env: ForwardModel, act: Act, goals: Goal, branch: jax.Array, corrections: int) -> tuple[Answer, jax.Array]:
-    """The best answers of given branches (n,), and their rewards (n,)."""
->>>>>>> mend
     observe = jax.vmap(env.question)
     judge = partial(_judge, env, goals)
 

@@ -131,14 +131,8 @@ def _same(arm: Arm, other: Arm) -> bool:
     if arm.joint_names != other.joint_names:
         return False
     q = arm.sample(jax.random.key(0), (100,))
-    return all(
-        np.allclose(one, two, atol=1e-4)
-        for one, two in zip(
-            (arm.lower, arm.upper, *jax.vmap(arm.pose)(q)),
-            (other.lower, other.upper, *jax.vmap(other.pose)(q)),
-            strict=True,
-        )
-    )
+    ours, theirs = ([one.lower, one.upper, *jax.vmap(one.pose)(q)] for one in (arm, other))
+    return all(np.allclose(a, b, atol=1e-4) for a, b in zip(ours, theirs, strict=True))
 
 
 def _directions(point: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
-from arm5dof.vision.objects import CATALOGUE
+from arm5dof.vision.objects import CATALOGUE, CatalogueObject
 from arm5dof.vision.synthetic import textures
 from arm5dof.vision.synthetic.scene_builder import CAMERA, SECOND, SceneBuilder, distractor
 
@@ -43,6 +43,11 @@ class Placement:
     """Of its center in the base frame, (3,), metres."""
     yaw: float
     """About z, radians."""
+
+    @property
+    def catalogue_object(self) -> CatalogueObject:
+        """What it is."""
+        return CATALOGUE[self.class_id]
 
 
 @dataclass(frozen=True, eq=False)
