@@ -88,9 +88,13 @@ class Grasper:
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self) -> list[SeenObject]:
-        """What is seen now."""
+        """What is seen now, but for what lies in a bin."""
         self._say("look")
-        return self.perception(self.robot.image())
+        seen = self.perception(self.robot.image())
+        return [one for one in seen if one.position is None or not self._in_a_bin(one.position)]
+
+    def _in_a_bin(self, position: np.ndarray) -> bool:
+        return any(one.contains(position[None])[0] for one in self.bins.values())
 
     def pick(self, name: str) -> Outcome:
         """Pick up an object of a class and hold it, `CLEARANCE` above where it was.

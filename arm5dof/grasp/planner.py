@@ -75,6 +75,7 @@ class Planner:
         clearance: float,
         opening: float,
         without: int | None = None,
+        checked: bool = True,
     ) -> Approach | str:
         """A way to bring the site between the fingers to a point.
 
@@ -85,6 +86,7 @@ class Planner:
             clearance: Length of the straight line on which the point is approached, metres.
             opening: Of the gripper on the way, metres.
             without: Number of an object of the world that may be touched on the line.
+            checked: Whether motions that hit something are ruled out.
 
         Returns:
             The way, or why there is none.
@@ -103,6 +105,8 @@ class Planner:
         reason = "out of reach"
         for direction, candidates, valid in zip(directions, q, good.reshape(shape), strict=True):
             for line in _chains(candidates, valid, start)[:CHAINS]:
+                if not checked:
+                    return Approach(line[:1], line, direction)
                 reason = "would collide"
                 if not world.clear(line, opening, without):
                     continue
@@ -131,7 +135,7 @@ def _same(arm: Arm, other: Arm) -> bool:
     if arm.joint_names != other.joint_names:
         return False
     q = arm.sample(jax.random.key(0), (100,))
-    ours, theirs = ([one.lower, one.upper, *jax.vmap(one.pose)(q)] for one in (arm, other))
+    ours, theirs = ([np.asarray(x) for x in (one.lower, one.upper, *jax.vmap(one.pose)(q))] for one in (arm, other))
     return all(np.allclose(a, b, atol=1e-4) for a, b in zip(ours, theirs, strict=True))
 
 

@@ -23,6 +23,8 @@ FINGER_SPEED = 0.05
 """Of each finger, m/s: slow enough that the first to touch an object pushes it along and does not knock it away."""
 PATIENCE = 1.0
 """Seconds to wait for rest after the last target."""
+IMAGINED = 0.01
+"""How wide an object is that a dry run closes on, metres."""
 REST_STEPS = 10
 """Time steps without motion that count as rest."""
 
@@ -175,13 +177,13 @@ class DryRun:
         return self.commands[-1].joints.copy()
 
     def opening(self) -> float:
-        """See `Robot`."""
-        return self.commands[-1].opening
+        """See `Robot`: what it closes on is taken to be there."""
+        return max(self.commands[-1].opening, IMAGINED)
 
     def move(self, times: np.ndarray, joints: np.ndarray) -> None:
         """See `Robot`."""
         times, joints = _checked(times, joints, self._dof)
-        now, opening = self.commands[-1].time, self.opening()
+        now, opening = self.commands[-1].time, self.commands[-1].opening
         self.commands += [Command(now + float(t), q, opening) for t, q in zip(times, joints, strict=True)]
 
     def grip(self, opening: float) -> None:

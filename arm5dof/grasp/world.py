@@ -88,16 +88,18 @@ class World:
             if not self._clear(q, opening, None):
                 continue
             mujoco.mj_forward(self.model, self._data)
-            hidden = sum(self._hides(origin, way) for way in ways)
+            hidden = self._hidden(origin, ways)
             middle = float(np.abs(2 * (q - self.arm.lower) / (self.arm.upper - self.arm.lower) - 1).max())
             if (hidden, middle) < least:
                 best, least = q, (hidden, middle)
         return best
 
-    def _hides(self, origin: np.ndarray, way: np.ndarray) -> bool:
-        geom = np.full(1, -1, np.int32)
-        mujoco.mj_ray(self.model, self._data, origin, way, None, 1, -1, geom)
-        return geom[0] >= 0 and self.model.geom_contype[geom[0]] == ARM
+    def _hidden(self, origin: np.ndarray, ways: np.ndarray) -> int:
+        """How many lines of sight the arm is in the way of."""
+        n = len(ways)
+        geom, distance = np.full(n, -1, np.int32), np.empty(n)
+        mujoco.mj_multiRay(self.model, self._data, origin, ways.ravel(), None, 1, -1, geom, distance, None, n, 2.0)
+        return int((self.model.geom_contype[geom[geom >= 0]] == ARM).sum())
 
     def _clear(self, q: np.ndarray, opening: float, without: int | None) -> bool:
         data = self._data

@@ -109,7 +109,7 @@ class Checkpoints:
         step = self.latest
         if step is None:
             raise UserError(f"{self.folder} holds no complete checkpoint yet")
-        template = {name: _storable(leaf) for name, leaf in _named(like).items() if leaf.size}
+        template = {name: _storable(leaf) for name, leaf in named(like).items() if leaf.size}
         abstract = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in template.items()}
         with self._damage(step):
             record = self._record(step)[item]
@@ -124,7 +124,7 @@ class Checkpoints:
             )[item]
             if _describe(restored)["sha256"] != record["sha256"]:
                 raise ValueError("its contents do not match their digest")
-        return _rebuild(like, restored)
+        return rebuild(like, restored)
 
     def _record(self, step: int) -> dict[str, Any]:
         """What a checkpoint says of itself. Raises `UserError` if it was made with other settings."""
@@ -151,7 +151,8 @@ class Checkpoints:
         return _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one")
 
 
-def _named(tree: Any) -> dict[str, Any]:
+def named(tree: Any) -> dict[str, Any]:
+    """The leaves of a pytree by their names."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
@@ -170,10 +171,12 @@ def _storable(leaf: Any) -> Any:
 
 def _leaves(tree: Any) -> dict[str, np.ndarray]:
     """A pytree as named arrays; empty arrays, which tensorstore cannot write, are left out."""
-    return {name: np.asarray(_storable(leaf)) for name, leaf in _named(tree).items() if leaf.size}
+    return {name: np.asarray(_storable(leaf)) for name, leaf in named(tree).items() if leaf.size}
 
 
-def _rebuild(like: T, leaves: dict[str, Any]) -> T:
+def rebuild(like: T, leaves: dict[str, Any]) -> T:
+    """The pytree of the structure of `like` (shapes and types) from its leaves by their names."""
+
     def leaf(path: Any, template: Any) -> jax.Array:
         if not template.size:
             return jnp.zeros(template.shape, template.dtype)

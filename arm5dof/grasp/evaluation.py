@@ -1,0 +1,284 @@
+"""How often it works: random scenes in which one object is asked for, and why it went wrong where it did."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+
+from arm5dof.arm import load_arm
+from arm5dof.errors import UserError
+from arm5dof.grasp.grasper import CLEARANCE, Grasper, Outcome
+from arm5dof.grasp.gripper import SITE
+from arm5dof.grasp.perception import CameraPerception, Perception, SeenObject
+from arm5dof.grasp.planner import Planner
+from arm5dof.grasp.robot import SimulatedRobot
+from arm5dof.grasp.scene import UNDISTURBED, Disturbance, TabletopScene, tabletop_scene
+from arm5dof.grasp.world import World
+from arm5dof.runtime import xla
+from arm5dof.training.policy_file import load_policy
+from arm5dof.vision.detectors.loading import load_detector
+from arm5dof.vision.objects import CLASS_NAMES
+from arm5dof.vision.synthetic.scenes import MAX_OBJECTS
+
+Eyes = Literal["camera", "truth"]
+"""What the program sees: what its detector finds and localization places, or where objects truly are."""
+
+HOLD = 2.0
+"""Seconds for which an object must be held."""
+LIFT = 0.05
+"""Metres by which it must be lifted."""
+NEAR = 0.010
+"""From where it should be put it may lie so far, metres."""
+MISPLACED = 0.010
+"""An object that was thought so far from its place was lost by localization, metres."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all scenes have in common."""
+
+    policy: Path
+    """A run's folder or a policy's file."""
+    arm: str
+    """MJCF file of the arm with its gripper."""
+    radii: tuple[float, float]
+    """How near and far from the arm's axis objects lie, metres."""
+    seed: int
+    eyes: Eyes = "camera"
+    pick: str | None = None
+    """The class that is asked for; None for a random one that is there."""
+    place: tuple[float, float] | None = None
+    """Where it is put, metres, base frame; None to hold it."""
+    bin: str | None = None
+    """Or the bin in which it is put; "class" for that of its class."""
+    disturbance: Disturbance = UNDISTURBED
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of one scene."""
+
+    number: int
+    asked: str
+    reachable: bool
+    """Whether an object of the class is there that the arm could reach, were nothing else there."""
+    success: bool
+    """Lifted and held, and put where it should be; where none can be reached, whether that was said."""
+    wrong: bool
+    """Whether an object of another class was lifted."""
+    lost: str
+    """Where it was lost, empty if it was not."""
+
+
+LOST = ("missed", "wrong class", "localization", "policy", "collision", "grip", "place")
+"""Where requests are lost."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What came of many scenes."""
+
+    trials: tuple[Trial, ...]
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """How many reachable requests were lost, by where."""
+        found = Counter(one.lost for one in self.trials if one.reachable and not one.success)
+        return {name: found[name] for name in LOST if found[name]}
+
+    def as_json(self) -> dict[str, Any]:
+        """Percentages are of the requests that can be reached, wrong objects of all."""
+        reachable = [one for one in self.trials if one.reachable]
+        others = [one for one in self.trials if not one.reachable]
+        return {
+            "success_percent": 100 * sum(one.success for one in reachable) / max(1, len(reachable)),
+            "wrong_object_percent": 100 * sum(one.wrong for one in self.trials) / max(1, len(self.trials)),
+            "scenes": len(self.trials),
+            "reachable": len(reachable),
+            "unreachable_told": sum(one.success for one in others),
+            "failures": self.failures,
+        }
+
+
+def evaluate(setting: Setting, scenes: int, progress: Callable[[int], object] | None = None) -> Score:
+    """Try a request in each of many random scenes, in as many processes as there are cores.
+
+    Args:
+        setting: What they have in common.
+        scenes: How many.
+        progress: Told how many are done.
+
+    Raises:
+        UserError: A class, bin, arm or policy is none.
+    """
+    program = Program(setting)  # Faults of the setting are told here, once.
+    workers = min(xla.cores(), scenes)
+    if workers == 1:
+        return Score(tuple(_counted(map(program.trial, range(scenes)), progress)))
+    with multiprocessing.get_context("spawn").Pool(workers, _start, (setting,)) as pool:
+        return Score(tuple(_counted(pool.imap(_trial, range(scenes)), progress)))
+
+
+def _counted(trials: Iterator[Trial], progress: Callable[[int], object] | None) -> Iterator[Trial]:
+    for i, trial in enumerate(trials, 1):
+        yield trial
+        if progress is not None:
+            progress(i)
+
+
+class Observer:
+    """What is told how a trial goes; this one does not care."""
+
+    perception: Perception | None = None
+    """Instead of the program's own, such as one that remembers what it saw."""
+
+    def stage(self, words: str) -> None:
+        """Something begins."""
+
+    def step(self) -> None:
+        """A short time has passed in the scene."""
+
+
+class Program:
+    """What tries a request: policy, planner and detector, loaded once."""
+
+    def __init__(self, setting: Setting) -> None:
+        if setting.pick is not None and setting.pick not in CLASS_NAMES:
+            raise UserError(f"no class {setting.pick!r}: the detector knows {', '.join(CLASS_NAMES)}")
+        if setting.bin not in (None, "class", *CLASS_NAMES):
+            raise UserError(f"no bin {setting.bin!r}: there are {', '.join(CLASS_NAMES)}")
+        self.setting = setting
+        self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
+        self._detector = load_detector() if setting.eyes == "camera" else None
+
+    def scene(self, number: int) -> TabletopScene:
+        """A random scene, the arm at rest out of the camera's way."""
+        s = self.setting
+        build = partial(
+            tabletop_scene,
+            (s.seed, number),
+            arm=s.arm,
+            radii=s.radii,
+            count=(3, MAX_OBJECTS),
+            disturbance=s.disturbance,
+        )
+        seen = build()
+        return build(start=World(self.planner.arm, seen.bins.values()).rest(seen.camera))
+
+    def perception(self, scene: TabletopScene) -> Perception:
+        """What is seen of a scene."""
+        if self._detector is not None:
+            return CameraPerception(self._detector, scene.camera)
+        return lambda _: [
+            SeenObject(one.catalogue_object.name, 1.0, position, 0.0)
+            for one, position in zip(scene.objects, scene.object_poses()[0], strict=True)
+        ]
+
+    def trial(self, number: int, watch: Callable[[TabletopScene, Perception], Observer] | None = None) -> Trial:
+        """Ask for one object in one scene.
+
+        Args:
+            number: Of the scene.
+            watch: Makes what is told how it goes.
+        """
+        s, scene = self.setting, self.scene(number)
+        perception = self.perception(scene)
+        observer = watch(scene, perception) if watch is not None else Observer()
+        names = [one.catalogue_object.name for one in scene.objects]
+        rng = np.random.default_rng((s.seed, number))
+        asked = s.pick or (str(rng.choice(names)) if names else CLASS_NAMES[0])
+        reachable = any(name == asked and self._reachable(scene, i) for i, name in enumerate(names))
+        robot = SimulatedRobot(scene, on_step=observer.step)
+        eyes, bins = observer.perception or perception, scene.bins.values()
+        grasper = Grasper(robot, eyes, self.planner, robot.joints(), bins, observer.stage)
+        outcome = grasper.pick(asked)
+        if outcome.success:
+            robot.move(np.array([HOLD]), robot.joints()[None])
+        lifted = [name for name, up in zip(names, scene.lifted(LIFT), strict=True) if up]
+        wrong = any(name != asked for name in lifted)
+        held = outcome.success and asked in lifted
+        placed = True
+        if held and (s.place or s.bin):
+            which = int(np.flatnonzero([n == asked and up for n, up in zip(names, scene.lifted(LIFT), strict=True)])[0])
+            bin = asked if s.bin == "class" else s.bin
+            there = grasper.place(s.place and np.array(s.place), bin)
+            placed = there.success and _at_rest(scene, which, s.place, bin)
+        success = held and placed if reachable else not outcome.success and not wrong
+        lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
+        return Trial(number, asked, reachable, success, wrong, lost)
+
+    def _reachable(self, scene: TabletopScene, i: int) -> bool:
+        world = World(self.planner.arm)
+        way = self.planner.approach(world, self.planner.arm.home, scene.start[i], CLEARANCE, 0.0, checked=False)
+        return not isinstance(way, str)
+
+
+def _at_rest(scene: TabletopScene, which: int, place: Sequence[float] | None, bin: str | None) -> bool:
+    if bin is not None:
+        return bool(scene.in_bin(bin)[which])
+    away = scene.object_poses()[0][which, :2] - np.asarray(place)
+    return bool(np.hypot(*away) <= NEAR and scene.resting()[which])
+
+
+def _lost(outcome: Outcome, held: bool, wrong: bool, scene: TabletopScene, names: list[str], asked: str) -> str:
+    """Where a request was lost: the first stage that was wrong."""
+    if wrong:
+        return "wrong class"
+    if outcome.stage in ("see", "locate"):
+        return "missed"
+    if outcome.stage in ("reach", "collide"):
+        return "policy" if outcome.stage == "reach" else "collision"
+    if held:
+        return "place"
+    places = scene.start[[name == asked for name in names]]
+    if outcome.position is not None and len(places):
+        off = np.linalg.norm(places - outcome.position, axis=1).min()
+        if off > MISPLACED:
+            return "localization"
+    return "grip"
+
+
+_program: Program
+
+
+def _start(setting: Setting) -> None:
+    """In a worker process: it has one core, and an interrupt is its parent's affair."""
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    global _program
+    _program = Program(setting)
+
+
+def _trial(number: int) -> Trial:
+    return _program.trial(number)
+
+
+def table(score: Score) -> str:
+    """For people."""
+    found = score.as_json()
+    lines = [
+        f"{found['success_percent']:.2f} % of {found['reachable']} reachable requests, "
+        f"another object lifted in {found['wrong_object_percent']:.2f} % of {found['scenes']} scenes"
+    ]
+    told = found["scenes"] - found["reachable"]
+    if told:
+        lines.append(f"{found['unreachable_told']} of {told} requests out of reach were told so")
+    lines += [f"  {count:4} lost by {name}" for name, count in found["failures"].items()]
+    return "\n".join(lines)
+
+
+def rows(score: Score) -> list[dict[str, Any]]:
+    """A row for each scene."""
+    return [asdict(one) for one in score.trials]
+
+
+EYES: tuple[Eyes, ...] = get_args(Eyes)
