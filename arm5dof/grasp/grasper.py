@@ -33,6 +33,8 @@ SQUEEZE = 0.02
 """How much narrower than an object it is told to close, metres: what makes the grip firm."""
 SPEED = 1.5
 """Of the fastest joint on the way, rad/s, and a third of it on the line to an object."""
+DOUBT = 0.6
+"""Of less confidence, what is seen is taken for an obstacle at the first attempt only."""
 ATTEMPTS = 3
 """From as many images."""
 DROP = 0.003
@@ -125,7 +127,7 @@ class Grasper:
             # Another image of the same table shows the same.
             if outcome.success or outcome.stage == "reach" or (unseen and (again or self._second is None)):
                 break
-            again = unseen
+            again = unseen or outcome.stage == "collide"
         return outcome
 
     def place(self, point: np.ndarray | None = None, bin: str | None = None) -> Outcome:
@@ -163,8 +165,12 @@ class Grasper:
     def _attempt(self, name: str, attempt: int, again: bool) -> Outcome:
         seen = self.look(again)
         wanted = [one for one in seen if one.name == name]
-        self._objects = [one for one in seen if one.position is not None]
         located = [one for one in wanted if one.position is not None]
+        # Where everything would collide, the doubtful may not be there.
+        doubt = 0.0 if attempt == 1 else DOUBT
+        self._objects = [
+            one for one in seen if one.position is not None and (one.confidence >= doubt or one.name == name)
+        ]
         if not wanted:
             return Outcome("see", f"no {name} is seen", attempt)
         if not located:
