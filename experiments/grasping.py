@@ -72,8 +72,8 @@ def markdown(found: dict[str, dict]) -> str:
     lines = [
         "# Grasping: one object of a random class that is there, lifted by 5 cm and held for 2 s",
         "",
-        f"Command: `python experiments/grasping.py`, seed {SEED}. {platform.machine()} CPU. Success is of the requests that",
-        "the arm can reach and of which the camera sees half or more; in brackets, of all that it can reach.",
+        f"Command: `python experiments/grasping.py`, seed {SEED}. {platform.machine()} CPU. Success is of the",
+        "requests that the arm can reach and of which the camera sees half or more; in brackets, of all that it can reach.",
         "",
         "| | scenes | success | another object lifted | lost by |",
         "| --- | ---: | ---: | ---: | --- |",
