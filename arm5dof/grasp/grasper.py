@@ -16,7 +16,7 @@ from arm5dof.grasp.perception import Perception, SeenObject
 from arm5dof.grasp.planner import Approach, Planner
 from arm5dof.grasp.robot import Robot
 from arm5dof.grasp.world import World
-from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
+from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES, CatalogueObject
 
 Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "done"]
 """Where an attempt ended. see: no object of the class was seen; locate: none could be located; reach: the policy has no
@@ -85,6 +85,7 @@ class Grasper:
         self.bins = {one.name: one for one in bins}
         self._say = on_stage
         self._objects: list[SeenObject] = []
+        self._held: CatalogueObject | None = None
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self) -> list[SeenObject]:
@@ -128,12 +129,14 @@ class Grasper:
             What came of it. Unless it is `done` the arm still holds the object.
 
         Raises:
-            UserError: There is no such bin, or not one of the two was given.
+            UserError: Nothing is held, there is no such bin, or not one of the two was given.
         """
         if (point is None) == (bin is None):
             raise UserError("place takes a point or the name of a bin")
         if bin is not None and bin not in self.bins:
             raise UserError(f"no bin {bin!r}: there are {', '.join(self.bins) or 'none'}")
+        if self._held is None:
+            raise UserError("nothing is held: pick something first")
         where = self.bins[bin].position if bin is not None else np.asarray(point, float)
         height = self._held.half_height + (BIN_HEIGHT if bin is not None else DROP)
         self._say(f"place at {1e3 * where[0]:.0f} {1e3 * where[1]:.0f} mm")
@@ -145,6 +148,7 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way", way)
         self.robot.grip(opening + SLACK)
+        self._held = None
         self._retreat(way)
         self._go_to_rest()
         return Outcome("done")
@@ -158,7 +162,7 @@ class Grasper:
             return Outcome("see", f"no {name} is seen", attempt)
         if not located:
             return Outcome("locate", f"a {name} is seen, but {wanted[0].failure}", attempt)
-        kind = self._held = next(one for one in CATALOGUE if one.name == name)
+        kind = next(one for one in CATALOGUE if one.name == name)
         outcome = Outcome("reach")
         for target in located:
             assert target.position is not None
@@ -188,12 +192,14 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
         self._objects = [one for one in self._objects if one is not target]
+        self._held = next(one for one in CATALOGUE if one.name == target.name)
         return Outcome("done", attempts=attempt, position=target.position)
 
     def _give_up(
         self, stage: Stage, reason: str, way: Approach, attempt: int = 1, target: SeenObject | None = None
     ) -> Outcome:
         self._say(f"give up: {reason}")
+        self._held = None
         self.robot.grip(self._widest / 2)
         if np.abs(self.robot.joints() - way.line[-1]).max() < np.abs(self.robot.joints() - way.line[0]).max():
             self._retreat(way)
