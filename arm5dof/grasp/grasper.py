@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -129,7 +129,7 @@ class Grasper:
             What came of it. Unless it is `done` the arm still holds the object.
 
         Raises:
-            UserError: Nothing is held, there is no such bin, or not one of the two was given.
+            UserError: Nothing is held, there is no such bin, the point is none, or not one of the two was given.
         """
         if (point is None) == (bin is None):
             raise UserError("place takes a point or the name of a bin")
@@ -137,7 +137,7 @@ class Grasper:
             raise UserError(f"no bin {bin!r}: there are {', '.join(self.bins) or 'none'}")
         if self._held is None:
             raise UserError("nothing is held: pick something first")
-        where = self.bins[bin].position if bin is not None else np.asarray(point, float)
+        where = checked_place(point) if point is not None else self.bins[str(bin)].position
         height = self._held.half_height + (BIN_HEIGHT if bin is not None else DROP)
         self._say(f"place at {1e3 * where[0]:.0f} {1e3 * where[1]:.0f} mm")
         opening = self.robot.opening()
@@ -223,3 +223,11 @@ class Grasper:
         before = np.concatenate([[self.robot.joints()], path[:-1]])
         seconds = np.maximum(np.abs(path - before).max(1) / speed, 0.02)
         self.robot.move(np.cumsum(seconds), path)
+
+
+def checked_place(point: np.ndarray | Sequence[float]) -> np.ndarray:
+    """A point of the table, (2,), metres. Raises `UserError` if it is none."""
+    found = np.asarray(point, float)
+    if found.shape != (2,) or not np.isfinite(found).all():
+        raise UserError(f"no place {' '.join(map(str, np.ravel(found)))}: give x and y, metres")
+    return found
