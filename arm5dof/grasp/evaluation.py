@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import cv2
+import mujoco
 import numpy as np
 
 from arm5dof.arm import load_arm
@@ -27,6 +28,9 @@ from arm5dof.runtime import xla
 from arm5dof.training.policy_file import load_policy
 from arm5dof.vision.detectors.loading import load_detector
 from arm5dof.vision.objects import CLASS_NAMES
+from arm5dof.vision.rendering.simulated import simulated_camera
+from arm5dof.vision.synthetic.ground_truth import truth
+from arm5dof.vision.synthetic.scene_builder import CAMERA
 from arm5dof.vision.synthetic.scenes import MAX_OBJECTS
 
 Eyes = Literal["camera", "truth"]
@@ -71,6 +75,8 @@ class Trial:
     asked: str
     reachable: bool
     """Whether an object of the class is there that the arm could reach, were nothing else there."""
+    in_sight: bool
+    """Whether one of those can be seen as the detector's own evaluation demands it, half of it or more."""
     success: bool
     """Lifted and held, and put where it should be; where none can be reached, whether that was said."""
     wrong: bool
@@ -91,19 +97,24 @@ class Score:
 
     @property
     def failures(self) -> dict[str, int]:
-        """How many reachable requests were lost, by where."""
-        found = Counter(one.lost for one in self.trials if one.reachable and not one.success)
+        """How many requests that can be reached and are in sight were lost, by where."""
+        found = Counter(one.lost for one in self.trials if one.reachable and one.in_sight and not one.success)
         return {name: found[name] for name in LOST if found[name]}
 
     def as_json(self) -> dict[str, Any]:
-        """Percentages are of the requests that can be reached, wrong objects of all."""
+        """`success_percent` is of the requests that can be reached and are in sight, `reachable_percent` of all that
+        can be reached, `wrong_object_percent` of all scenes."""
         reachable = [one for one in self.trials if one.reachable]
+        seen = [one for one in reachable if one.in_sight]
         others = [one for one in self.trials if not one.reachable]
+        percent = lambda of, n: 100 * sum(of) / max(1, n)
         return {
-            "success_percent": 100 * sum(one.success for one in reachable) / max(1, len(reachable)),
-            "wrong_object_percent": 100 * sum(one.wrong for one in self.trials) / max(1, len(self.trials)),
+            "success_percent": percent((one.success for one in seen), len(seen)),
+            "wrong_object_percent": percent((one.wrong for one in self.trials), len(self.trials)),
             "scenes": len(self.trials),
+            "in_sight": len(seen),
             "reachable": len(reachable),
+            "reachable_percent": percent((one.success for one in reachable), len(reachable)),
             "unreachable_told": sum(one.success for one in others),
             "failures": self.failures,
         }
@@ -160,7 +171,7 @@ class Program:
             checked_place(setting.place)
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
-        self._detector = load_detector() if setting.eyes == "camera" else None
+        self._detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []
 
     def scene(self, number: int) -> TabletopScene:
         """A random scene, the arm at rest out of the camera's way."""
@@ -176,14 +187,11 @@ class Program:
         seen = build()
         return build(start=World(self.planner.arm, seen.bins.values()).rest(seen.camera))
 
-    def perception(self, scene: TabletopScene) -> Perception:
-        """What is seen of a scene."""
-        if self._detector is not None:
-            return CameraPerception(self._detector, scene.camera)
-        return lambda _: [
-            SeenObject(one.catalogue_object.name, 1.0, position, 0.0)
-            for one, position in zip(scene.objects, scene.object_poses()[0], strict=True)
-        ]
+    def perceptions(self, scene: TabletopScene) -> list[Perception]:
+        """What is seen of a scene, at the first look and at the second."""
+        if self._detectors:
+            return [CameraPerception(detector, scene.camera) for detector in self._detectors]
+        return [partial(_true, scene)]
 
     def trial(self, number: int, watch: Callable[[TabletopScene, Perception], Observer] | None = None) -> Trial:
         """Ask for one object in one scene.
@@ -193,15 +201,18 @@ class Program:
             watch: Makes what is told how it goes.
         """
         s, scene = self.setting, self.scene(number)
-        perception = self.perception(scene)
-        observer = watch(scene, perception) if watch is not None else Observer()
+        first, *second = self.perceptions(scene)
+        observer = watch(scene, first) if watch is not None else Observer()
         names = [one.catalogue_object.name for one in scene.objects]
         rng = np.random.default_rng((s.seed, number))
         asked = s.pick or (str(rng.choice(names)) if names else CLASS_NAMES[0])
-        reachable = any(name == asked and self._reachable(scene, i) for i, name in enumerate(names))
+        within = [i for i, name in enumerate(names) if name == asked and self._reachable(scene, i)]
+        reachable, in_sight = bool(within), self.setting.eyes == "truth" or bool(_visible(scene) & set(within))
         robot = SimulatedRobot(scene, on_step=observer.step)
-        eyes, bins = observer.perception or perception, scene.bins.values()
-        grasper = Grasper(robot, eyes, self.planner, robot.joints(), bins, observer.stage)
+        first = observer.perception or first
+        look_again = second[0] if second else None
+        bins = scene.bins.values()
+        grasper = Grasper(robot, first, self.planner, robot.joints(), bins, look_again, observer.stage)
         outcome = grasper.pick(asked)
         if outcome.success:
             robot.move(np.array([HOLD]), robot.joints()[None])
@@ -216,12 +227,28 @@ class Program:
             placed = there.success and _at_rest(scene, which, s.place, bin)
         success = held and placed if reachable else not outcome.success and not wrong
         lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
-        return Trial(number, asked, reachable, success, wrong, lost)
+        return Trial(number, asked, reachable, in_sight, success, wrong, lost)
 
     def _reachable(self, scene: TabletopScene, i: int) -> bool:
         world = World(self.planner.arm)
         way = self.planner.approach(world, self.planner.arm.home, scene.start[i], CLEARANCE, 0.0, checked=False)
         return not isinstance(way, str)
+
+
+def _true(scene: TabletopScene, image: np.ndarray) -> list[SeenObject]:
+    """Where objects truly are, whatever an image shows."""
+    return [
+        SeenObject(one.catalogue_object.name, 1.0, position, 0.0)
+        for one, position in zip(scene.objects, scene.object_poses()[0], strict=True)
+    ]
+
+
+def _visible(scene: TabletopScene) -> set[int]:
+    """The objects of which the camera sees half or more."""
+    camera = simulated_camera(scene.model, CAMERA, scene.camera.width, scene.camera.height)
+    mujoco.mj_forward(scene.model, scene.data)
+    found = truth(scene, camera.segmentation(scene.data))
+    return {i for i, at in enumerate(scene.start) if (np.abs(found.position[found.counts] - at).max(1) < 1e-6).any()}
 
 
 def _at_rest(scene: TabletopScene, which: int, place: Sequence[float] | None, bin: str | None) -> bool:
@@ -268,8 +295,9 @@ def table(score: Score) -> str:
     """For people."""
     found = score.as_json()
     lines = [
-        f"{found['success_percent']:.2f} % of {found['reachable']} reachable requests, "
-        f"another object lifted in {found['wrong_object_percent']:.2f} % of {found['scenes']} scenes"
+        f"{found['success_percent']:.2f} % of {found['in_sight']} requests that can be reached and are in sight, "
+        f"{found['reachable_percent']:.2f} % of all {found['reachable']} that can be reached",
+        f"another object lifted in {found['wrong_object_percent']:.2f} % of {found['scenes']} scenes",
     ]
     told = found["scenes"] - found["reachable"]
     if told:

@@ -21,7 +21,7 @@ from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES, CatalogueObject
 Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "done"]
 """Where an attempt ended. see: no object of the class was seen; locate: none could be located; reach: the policy has no
 answer; collide: every motion would hit something; grip: the fingers closed on nothing; lift: what they held was lost;
-identify: what they hold is not as wide as the class; place: no way to where it should go; done: as asked."""
+identify: what they hold is wider than the class can be; place: no way to where it should go; done: as asked."""
 
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
@@ -33,10 +33,16 @@ SQUEEZE = 0.02
 """How much narrower than an object it is told to close, metres: what makes the grip firm."""
 SPEED = 1.5
 """Of the fastest joint on the way, rad/s, and a third of it on the line to an object."""
+DOUBT = 0.6
+"""Of less confidence, what is seen is taken for an obstacle at the first attempt only."""
 ATTEMPTS = 3
 """From as many images."""
 DROP = 0.003
 """Above where it will rest an object is let go, metres."""
+ARRIVED = 0.05
+"""Where a joint is further from its target, something is in the way, radians."""
+WIDER = 0.004
+"""What is held may be so much wider than its class, metres."""
 LEAST = 0.002
 """An object between the fingers is at least so wide, metres."""
 
@@ -69,6 +75,7 @@ class Grasper:
         planner: What finds motions.
         rest: Where the arm waits, out of the camera's way, (dof,), radians.
         bins: By name.
+        second_look: What is asked where `perception` does not see what it should; slower and surer.
         on_stage: Called with a few words whenever it begins something, such as for a video.
     """
 
@@ -79,19 +86,21 @@ class Grasper:
         planner: Planner,
         rest: np.ndarray,
         bins: Iterable[Bin] = (),
+        second_look: Perception | None = None,
         on_stage: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.robot, self.perception, self.planner, self.rest = robot, perception, planner, rest
         self.bins = {one.name: one for one in bins}
-        self._say = on_stage
+        self._second, self._say = second_look, on_stage
         self._objects: list[SeenObject] = []
         self._held: CatalogueObject | None = None
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
-    def look(self) -> list[SeenObject]:
-        """What is seen now, but for what lies in a bin."""
-        self._say("look")
-        seen = self.perception(self.robot.image())
+    def look(self, again: bool = False) -> list[SeenObject]:
+        """What is seen now, but for what lies in a bin. `again` takes the second look."""
+        self._say("look again" if again else "look")
+        perception = self._second if again and self._second is not None else self.perception
+        seen = perception(self.robot.image())
         return [one for one in seen if one.position is None or not self._in_a_bin(one.position)]
 
     def _in_a_bin(self, position: np.ndarray) -> bool:
@@ -111,11 +120,15 @@ class Grasper:
         """
         if name not in CLASS_NAMES:
             raise UserError(f"no class {name!r}: the detector knows {', '.join(CLASS_NAMES)}")
-        outcome = Outcome("see")
+        outcome, again = Outcome("see"), False
+        self._met: list[np.ndarray] = []
         for attempt in range(1, ATTEMPTS + 1):
-            outcome = self._attempt(name, attempt)
-            if outcome.success or outcome.stage in ("see", "locate", "reach"):
-                break  # Another image of the same table would show the same.
+            outcome = self._attempt(name, attempt, again)
+            unseen = outcome.stage in ("see", "locate")
+            # Another image of the same table shows the same.
+            if outcome.success or outcome.stage == "reach" or (unseen and (again or self._second is None)):
+                break
+            again = unseen or outcome.stage == "collide"
         return outcome
 
     def place(self, point: np.ndarray | None = None, bin: str | None = None) -> Outcome:
@@ -153,11 +166,15 @@ class Grasper:
         self._go_to_rest()
         return Outcome("done")
 
-    def _attempt(self, name: str, attempt: int) -> Outcome:
-        seen = self.look()
+    def _attempt(self, name: str, attempt: int, again: bool) -> Outcome:
+        seen = self.look(again)
         wanted = [one for one in seen if one.name == name]
-        self._objects = [one for one in seen if one.position is not None]
         located = [one for one in wanted if one.position is not None]
+        # Where everything would collide, the doubtful may not be there.
+        doubt = 0.0 if attempt == 1 else DOUBT
+        self._objects = [
+            one for one in seen if one.position is not None and (one.confidence >= doubt or one.name == name)
+        ]
         if not wanted:
             return Outcome("see", f"no {name} is seen", attempt)
         if not located:
@@ -178,15 +195,21 @@ class Grasper:
     def _approach(self, point: np.ndarray, opening: float, target: SeenObject | None = None) -> Approach | str:
         world = World(self.planner.arm, self.bins.values(), self._objects)
         without = None if target is None else self._objects.index(target)
-        return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without)
+        return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without, self._met)
 
     def _grasp(self, way: Approach, target: SeenObject, opening: float, attempt: int) -> Outcome:
         self._say(f"grasp the {target.name}")
         self.robot.grip(opening)
         self._go(way)
+        if np.abs(self.robot.joints() - way.line[-1]).max() > ARRIVED:
+            self._met.append(way.direction)
+            return self._give_up("collide", "the arm met something on the way", way, attempt, target)
         self.robot.grip(-SQUEEZE)
         if self.robot.opening() < LEAST:
             return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
+        if self.robot.opening() > 2 * self._held.radius + WIDER:
+            self._met.append(way.direction)
+            return self._give_up("identify", f"what is between the fingers is no {target.name}", way, attempt, target)
         self._say("lift")
         self._retreat(way)
         if self.robot.opening() < LEAST:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -24,8 +25,13 @@ POINTS = 6
 CORRECTIONS = 8
 MAX_DISTANCE, MAX_ANGLE = 0.002, np.deg2rad(3)
 """What an answer may be off."""
+AVOIDED = np.deg2rad(12)
+"""What was met in one direction is met in others as near, radians."""
 JUMP = 0.5
 """A joint turns less from one pose on the line to the next, radians; more is another branch."""
+ALLOWED = (0.0, 0.003, 0.006)
+"""How deep a motion may cut into what is known, metres, the first at which there is one: objects count as upright
+cylinders, up to 5 mm wider than they are."""
 CHAINS = 6
 """How many chains of answers are tried for each direction."""
 
@@ -75,6 +81,7 @@ class Planner:
         clearance: float,
         opening: float,
         without: int | None = None,
+        avoid: Sequence[np.ndarray] = (),
         checked: bool = True,
     ) -> Approach | str:
         """A way to bring the site between the fingers to a point.
@@ -83,17 +90,20 @@ class Planner:
             world: What is known to be around.
             start: Where the arm is, (dof,), radians.
             point: Where it is to be, (3,), metres, base frame.
-            clearance: Length of the straight line on which the point is approached, metres.
+            clearance: How far above the point the straight line begins on which it is approached, metres.
             opening: Of the gripper on the way, metres.
             without: Number of an object of the world that may be touched on the line.
+            avoid: Directions in which the tool met something that is not known.
             checked: Whether motions that hit something are ruled out.
 
         Returns:
             The way, or why there is none.
         """
         directions = _directions(point)
-        along = np.linspace(clearance, 0, POINTS)
-        targets = point - directions[:, None] * along[:, None]
+        tried = [(directions @ other > np.cos(AVOIDED)) for other in avoid]
+        directions = directions[~np.any(tried, 0)] if tried else directions
+        along = np.linspace(clearance, 0, POINTS) / -directions[:, 2:]
+        targets = point - directions[:, None] * along[..., None]
         answer = self.policy.solve(
             targets.reshape(-1, 3), np.repeat(directions, POINTS, 0), corrections=CORRECTIONS, candidates=True
         )
@@ -102,22 +112,28 @@ class Planner:
         good = (np.asarray(answer.errors["distance"]) <= MAX_DISTANCE) & (
             np.asarray(answer.errors["angle"]) <= MAX_ANGLE
         )
-        reason = "out of reach"
-        for direction, candidates, valid in zip(directions, q, good.reshape(shape), strict=True):
-            for line in _chains(candidates, valid, start)[:CHAINS]:
-                if not checked:
-                    return Approach(line[:1], line, direction)
-                reason = "would collide"
-                if not world.clear(line, opening, without):
-                    continue
-                transit = self.transit(world, start, line[0], opening)
-                if transit is not None:
-                    return Approach(transit, line, direction)
-        return reason
+        ways = [
+            (direction, line)
+            for direction, candidates, valid in zip(directions, q, good.reshape(shape), strict=True)
+            for line in _chains(candidates, valid, start)[:CHAINS]
+        ]
+        if not ways:
+            return "out of reach"
+        if not checked:
+            return Approach(ways[0][1][:1], ways[0][1], ways[0][0])
+        for allowed in ALLOWED:
+            for direction, line in ways:
+                if world.clear(line, opening, without, allowed):
+                    transit = self.transit(world, start, line[0], opening, allowed)
+                    if transit is not None:
+                        return Approach(transit, line, direction)
+        return "would collide"
 
-    def transit(self, world: World, start: np.ndarray, end: np.ndarray, opening: float) -> np.ndarray | None:
+    def transit(
+        self, world: World, start: np.ndarray, end: np.ndarray, opening: float, allowed: float = ALLOWED[-1]
+    ) -> np.ndarray | None:
         """A path from one pose to another, (k, dof), straight or by way of one other pose; None if none is clear."""
-        if world.clear(path := np.stack([start, end]), opening):
+        if world.clear(path := np.stack([start, end]), opening, allowed=allowed):
             return path
         rng = np.random.default_rng(0)
         middle = (start + end) / 2
@@ -125,7 +141,7 @@ class Planner:
             spread = 0.15 + 0.01 * k
             via = middle + spread * (self.arm.upper - self.arm.lower) * rng.uniform(-0.5, 0.5, len(start))
             path = np.stack([start, np.clip(via, self.arm.lower, self.arm.upper), end])
-            if world.clear(path, opening):
+            if world.clear(path, opening, allowed=allowed):
                 return path
         return None
 

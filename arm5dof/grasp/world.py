@@ -18,8 +18,6 @@ from arm5dof.vision.objects import CATALOGUE
 
 STEP = 0.04
 """How finely motions are checked: the largest turn of a joint between one pose and the next, radians."""
-ALLOWED = 0.003
-"""How deep a motion may cut into what is known, metres: objects count as upright cylinders, wider than they are."""
 REST_POSES = 400
 """Among so many random poses the one is taken that hides least from the camera."""
 ROOM = (0.08, 0.28)
@@ -63,15 +61,16 @@ class World:
         fixed = self.model.body_weldid[self.model.geom_bodyid] == 0
         self.model.geom_contype[fixed] = 0
 
-    def clear(self, path: np.ndarray, opening: float, without: int | None = None) -> bool:
+    def clear(self, path: np.ndarray, opening: float, without: int | None = None, allowed: float = 0.0) -> bool:
         """Whether the arm hits nothing on a path.
 
         Args:
             path: Joint positions (k, dof), radians, between which joints move in straight lines.
             opening: Of the gripper, metres.
             without: Number of an object that may be touched.
+            allowed: How deep it may cut into what it meets, metres.
         """
-        return all(self._clear(q, opening, without) for q in dense(path))
+        return all(self._clear(q, opening, without, allowed) for q in dense(path))
 
     def rest(self, camera: Camera, opening: float = 0.0) -> np.ndarray:
         """A pose out of the camera's way, (dof,), radians: of random poses that hit nothing the one that hides least of
@@ -85,7 +84,7 @@ class World:
         best, least = self.arm.home, (np.inf, np.inf)
         for _ in range(REST_POSES):
             q = rng.uniform(self.arm.lower, self.arm.upper)
-            if not self._clear(q, opening, None):
+            if not self._clear(q, opening, None, 0.0):
                 continue
             mujoco.mj_forward(self.model, self._data)
             hidden = self._hidden(origin, ways)
@@ -101,14 +100,14 @@ class World:
         mujoco.mj_multiRay(self.model, self._data, origin, ways.ravel(), None, 1, -1, geom, distance, None, n, 2.0)
         return int((self.model.geom_contype[geom[geom >= 0]] == ARM).sum())
 
-    def _clear(self, q: np.ndarray, opening: float, without: int | None) -> bool:
+    def _clear(self, q: np.ndarray, opening: float, without: int | None, allowed: float) -> bool:
         data = self._data
         data.qpos[self.arm.qpos] = q
         data.qpos[self.gripper.qpos] = self.gripper.fingers(opening)
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
         mujoco.mj_collision(self.model, data)
-        deep = data.contact.dist < -ALLOWED
+        deep = data.contact.dist < -allowed
         if without is not None:
             deep &= ~(data.contact.geom == self._objects[without]).any(1)
         return not deep.any()
