@@ -187,7 +187,7 @@ class Grasper:
             opening = min(2 * kind.radius + SLACK, self._widest)
             way = self._approach(target.position, opening, target)
             if not isinstance(way, str):
-                return self._grasp(way, target, opening, attempt)
+                return self._grasp(way, target, kind, opening, attempt)
             stage: Stage = "reach" if way == "out of reach" else "collide"
             outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, target.position)
         return outcome
@@ -197,7 +197,7 @@ class Grasper:
         without = None if target is None else self._objects.index(target)
         return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without, self._met)
 
-    def _grasp(self, way: Approach, target: SeenObject, opening: float, attempt: int) -> Outcome:
+    def _grasp(self, way: Approach, target: SeenObject, kind: CatalogueObject, opening: float, attempt: int) -> Outcome:
         self._say(f"grasp the {target.name}")
         self.robot.grip(opening)
         self._go(way)
@@ -207,7 +207,7 @@ class Grasper:
         self.robot.grip(-SQUEEZE)
         if self.robot.opening() < LEAST:
             return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
-        if self.robot.opening() > 2 * self._held.radius + WIDER:
+        if self.robot.opening() > 2 * kind.radius + WIDER:
             self._met.append(way.direction)
             return self._give_up("identify", f"what is between the fingers is no {target.name}", way, attempt, target)
         self._say("lift")
@@ -215,7 +215,7 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
         self._objects = [one for one in self._objects if one is not target]
-        self._held = next(one for one in CATALOGUE if one.name == target.name)
+        self._held = kind
         return Outcome("done", attempts=attempt, position=target.position)
 
     def _give_up(

@@ -34,16 +34,19 @@ class Bench:
         self.names = [one.catalogue_object.name for one in self.scene.objects]
         self.robot = SimulatedRobot(self.scene)
         self.rest = self.robot.joints()
-        self.perception = program(eyes).perception(self.scene)
+        self.perception, *second = program(eyes).perceptions(self.scene)
         self.said: list[str] = []
         self.on_stage: Callable[[str], object] = lambda words: None
         five = {name: getattr(self.robot, name) for name in ("joints", "opening", "move", "grip", "image")}
         self.grasper = Grasper(
-            SimpleNamespace(**five), self.look, program(eyes).planner, self.rest, self.scene.bins.values(), self.tell
+            SimpleNamespace(**five),
+            lambda image: self.perception(image),
+            program(eyes).planner,
+            self.rest,
+            self.scene.bins.values(),
+            *second,
+            on_stage=self.tell,
         )
-
-    def look(self, image: np.ndarray) -> list[SeenObject]:
-        return self.perception(image)
 
     def tell(self, words: str) -> None:
         self.said.append(words)
@@ -87,7 +90,8 @@ def test_what_is_asked_for_is_lifted_and_held(number: int, eyes: Eyes):
 def test_what_is_not_there_is_said_not_to_be(eyes: Eyes):
     bench = Bench(0, eyes)
     outcome = bench.grasper.pick(bench.absent())
-    assert outcome.stage == "see" and not outcome.success and outcome.attempts == 1
+    assert outcome.stage == "see" and not outcome.success
+    assert bench.said == {"truth": ["look"], "camera": ["look", "look again"]}[eyes]
     assert outcome.reason == f"no {bench.absent()} is seen"
     assert bench.at_rest() and not bench.held()
     with_moon = said(lambda: bench.grasper.pick("moon"))
@@ -155,7 +159,7 @@ def test_fingers_that_close_on_nothing_feel_it(eyes: Eyes):
     bench.on_stage = lambda words: words == f"grasp the {name}" and bench.remove(name)
     outcome = bench.grasper.pick(name)
     assert "give up: the fingers closed on nothing" in bench.said
-    assert outcome.stage == {"truth": "reach", "camera": "see"}[eyes] and outcome.attempts == 2
+    assert outcome.stage == {"truth": "reach", "camera": "see"}[eyes] and outcome.attempts > 1
     assert bench.at_rest() and not bench.held()
 
 
