@@ -6,9 +6,16 @@ import argparse
 import json
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arm5dof.cli.parser import natural, nothing_left, positive
 from arm5dof.errors import UserError
+
+if TYPE_CHECKING:
+    from arm5dof.grasp.evaluation import Program, Trial
+    from arm5dof.grasp.perception import Perception
+    from arm5dof.grasp.scene import TabletopScene
+    from arm5dof.grasp.video import Recorder
 
 HELP = """\
 See, decide, grasp, place: pick objects by their class from random scenes on a table, in MuJoCo's physics, from a
@@ -60,30 +67,31 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
     nothing_left(rest, "grasp")
     if (args.image is None) != (args.camera is None):
         raise UserError("--image and --camera go together")
+    if args.image is not None and (args.bin is not None or args.video is not None):
+        raise UserError("nothing moves for an --image, and it has no bins: leave out --bin and --video")
     if args.video is not None:
         from arm5dof.cli.vision.options import writable
 
         writable(args.video, (".mp4",))
-    from arm5dof.grasp.shipped import shipped
+    from arm5dof.grasp.shipped import ARMS, shipped
 
     policy = args.policy or shipped(args.arm).policy
     if args.image is not None:
         return _photograph(args, policy)
-    from arm5dof.grasp.evaluation import Program, Setting, evaluate, table
+    from arm5dof.grasp.evaluation import Program, Score, Setting, evaluate, table
     from arm5dof.runtime.progress import Bar
 
-    radii = tuple(args.radii) if args.radii else shipped(args.arm).radii if args.policy is None else (0.10, 0.25)
+    radii = tuple(args.radii) if args.radii else ARMS.get(args.arm, ARMS["arm5.xml"]).radii
     place = tuple(args.place) if args.place else None
     setting = Setting(policy, args.arm, radii, args.seed, args.eyes, args.pick, place, args.bin)
-    if args.scenes > 1 and args.video is None:
+    if args.scenes == 1 or args.video is not None:
+        trial = _watched(Program(setting), args.video, quiet=args.json)
+    if args.scenes > 1:
         with Bar("grasping", args.scenes, "scenes") as bar:
             score = evaluate(setting, args.scenes, bar.update)
         print(json.dumps(score.as_json()) if args.json else table(score))
         return 0
-    trial = _watched(Program(setting), args.video, quiet=args.json)
     if args.json:
-        from arm5dof.grasp.evaluation import Score
-
         print(json.dumps(Score((trial,)).as_json()))
     elif not trial.reachable:
         print(f"{trial.asked}: out of reach" + (", and told so" if trial.success else ""))
@@ -92,7 +100,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
     return 0 if trial.success else 1
 
 
-def _watched(program, video: Path | None, quiet: bool):  # type: ignore[no-untyped-def]
+def _watched(program: Program, video: Path | None, quiet: bool) -> Trial:
     """One trial, told as it goes, and recorded."""
     from arm5dof.grasp.evaluation import Observer
 
@@ -109,7 +117,7 @@ def _watched(program, video: Path | None, quiet: bool):  # type: ignore[no-untyp
     with files.replacing(video) as temporary:
         recorders: list[Recorder] = []
 
-        def watch(scene, perception):  # type: ignore[no-untyped-def]
+        def watch(scene: TabletopScene, perception: Perception) -> Recorder:
             recorders.append(Recorder(temporary, scene, perception))
             return recorders[0]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from arm5dof.arm import load_arm
 from arm5dof.errors import UserError
-from arm5dof.grasp.grasper import CLEARANCE, Grasper, Outcome
+from arm5dof.grasp.grasper import CLEARANCE, Grasper, Outcome, checked_place
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.perception import CameraPerception, Perception, SeenObject
 from arm5dof.grasp.planner import Planner
@@ -167,6 +167,8 @@ class Program:
             raise UserError(f"no class {setting.pick!r}: the detector knows {', '.join(CLASS_NAMES)}")
         if setting.bin not in (None, "class", *CLASS_NAMES):
             raise UserError(f"no bin {setting.bin!r}: there are {', '.join(CLASS_NAMES)}")
+        if setting.place is not None:
+            checked_place(setting.place)
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
         self._detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []

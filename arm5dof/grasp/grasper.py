@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -16,7 +16,7 @@ from arm5dof.grasp.perception import Perception, SeenObject
 from arm5dof.grasp.planner import Approach, Planner
 from arm5dof.grasp.robot import Robot
 from arm5dof.grasp.world import World
-from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
+from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES, CatalogueObject
 
 Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "done"]
 """Where an attempt ended. see: no object of the class was seen; locate: none could be located; reach: the policy has no
@@ -93,6 +93,7 @@ class Grasper:
         self.bins = {one.name: one for one in bins}
         self._second, self._say = second_look, on_stage
         self._objects: list[SeenObject] = []
+        self._held: CatalogueObject | None = None
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self, again: bool = False) -> list[SeenObject]:
@@ -141,13 +142,15 @@ class Grasper:
             What came of it. Unless it is `done` the arm still holds the object.
 
         Raises:
-            UserError: There is no such bin, or not one of the two was given.
+            UserError: Nothing is held, there is no such bin, the point is none, or not one of the two was given.
         """
         if (point is None) == (bin is None):
             raise UserError("place takes a point or the name of a bin")
         if bin is not None and bin not in self.bins:
             raise UserError(f"no bin {bin!r}: there are {', '.join(self.bins) or 'none'}")
-        where = self.bins[bin].position if bin is not None else np.asarray(point, float)
+        if self._held is None:
+            raise UserError("nothing is held: pick something first")
+        where = checked_place(point) if point is not None else self.bins[str(bin)].position
         height = self._held.half_height + (BIN_HEIGHT if bin is not None else DROP)
         self._say(f"place at {1e3 * where[0]:.0f} {1e3 * where[1]:.0f} mm")
         opening = self.robot.opening()
@@ -158,6 +161,7 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way", way)
         self.robot.grip(opening + SLACK)
+        self._held = None
         self._retreat(way)
         self._go_to_rest()
         return Outcome("done")
@@ -175,7 +179,7 @@ class Grasper:
             return Outcome("see", f"no {name} is seen", attempt)
         if not located:
             return Outcome("locate", f"a {name} is seen, but {wanted[0].failure}", attempt)
-        kind = self._held = next(one for one in CATALOGUE if one.name == name)
+        kind = next(one for one in CATALOGUE if one.name == name)
         outcome = Outcome("reach")
         for target in located:
             assert target.position is not None
@@ -183,7 +187,7 @@ class Grasper:
             opening = min(2 * kind.radius + SLACK, self._widest)
             way = self._approach(target.position, opening, target)
             if not isinstance(way, str):
-                return self._grasp(way, target, opening, attempt)
+                return self._grasp(way, target, kind, opening, attempt)
             stage: Stage = "reach" if way == "out of reach" else "collide"
             outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, target.position)
         return outcome
@@ -193,7 +197,7 @@ class Grasper:
         without = None if target is None else self._objects.index(target)
         return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without, self._met)
 
-    def _grasp(self, way: Approach, target: SeenObject, opening: float, attempt: int) -> Outcome:
+    def _grasp(self, way: Approach, target: SeenObject, kind: CatalogueObject, opening: float, attempt: int) -> Outcome:
         self._say(f"grasp the {target.name}")
         self.robot.grip(opening)
         self._go(way)
@@ -203,7 +207,7 @@ class Grasper:
         self.robot.grip(-SQUEEZE)
         if self.robot.opening() < LEAST:
             return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
-        if self.robot.opening() > 2 * self._held.radius + WIDER:
+        if self.robot.opening() > 2 * kind.radius + WIDER:
             self._met.append(way.direction)
             return self._give_up("identify", f"what is between the fingers is no {target.name}", way, attempt, target)
         self._say("lift")
@@ -211,12 +215,14 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
         self._objects = [one for one in self._objects if one is not target]
+        self._held = kind
         return Outcome("done", attempts=attempt, position=target.position)
 
     def _give_up(
         self, stage: Stage, reason: str, way: Approach, attempt: int = 1, target: SeenObject | None = None
     ) -> Outcome:
         self._say(f"give up: {reason}")
+        self._held = None
         self.robot.grip(self._widest / 2)
         if np.abs(self.robot.joints() - way.line[-1]).max() < np.abs(self.robot.joints() - way.line[0]).max():
             self._retreat(way)
@@ -240,3 +246,11 @@ class Grasper:
         before = np.concatenate([[self.robot.joints()], path[:-1]])
         seconds = np.maximum(np.abs(path - before).max(1) / speed, 0.02)
         self.robot.move(np.cumsum(seconds), path)
+
+
+def checked_place(point: np.ndarray | Sequence[float]) -> np.ndarray:
+    """A point of the table, (2,), metres. Raises `UserError` if it is none."""
+    found = np.asarray(point, float)
+    if found.shape != (2,) or not np.isfinite(found).all():
+        raise UserError(f"no place {' '.join(map(str, np.ravel(found)))}: give x and y, metres")
+    return found

@@ -145,8 +145,13 @@ def tabletop_scene(
         The scene, the arm and fingers at rest.
 
     Raises:
-        UserError: The seed is negative, there is no such style, too many bins, or the arm has no gripper.
+        UserError: The seed is negative, there is no such style, too many bins, the radii are none, or the arm has no
+            gripper.
     """
+    if not 0 < radii[0] <= radii[1] < np.inf:
+        raise UserError(
+            f"objects {radii[0]:g} to {radii[1]:g} m from the arm's axis: give two radii above 0, near first"
+        )
     friction = np.array(FRICTION) * disturbance.friction
     layout = random_layout(seed, style, _solid_arm(arm, friction), count, radii, objects)
     spec = layout.builder.spec

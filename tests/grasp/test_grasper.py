@@ -1,0 +1,212 @@
+"""From an image to a lifted object: what was asked for is done, or it is said why not and the arm is at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.errors import said
+
+from arm5dof.grasp.evaluation import Eyes, Program, Setting
+from arm5dof.grasp.grasper import ATTEMPTS, Grasper
+from arm5dof.grasp.perception import Perception, SeenObject
+from arm5dof.grasp.robot import DryRun, SimulatedRobot
+from arm5dof.grasp.scene import TabletopScene
+from arm5dof.grasp.shipped import shipped
+from arm5dof.vision.objects import CLASS_NAMES
+
+EYES: tuple[Eyes, ...] = ("truth", "camera")
+
+
+@cache
+def program(eyes: Eyes) -> Program:
+    return Program(Setting(shipped("arm5.xml").policy, "arm5.xml", shipped("arm5.xml").radii, 31, eyes))
+
+
+class Bench:
+    """A random scene, and a program that picks in it. Of the scene it gets nothing but what a real arm would give."""
+
+    def __init__(self, number: int, eyes: Eyes) -> None:
+        self.scene: TabletopScene = program(eyes).scene(number)
+        self.names = [one.catalogue_object.name for one in self.scene.objects]
+        self.robot = SimulatedRobot(self.scene)
+        self.rest = self.robot.joints()
+        self.perception, *second = program(eyes).perceptions(self.scene)
+        self.said: list[str] = []
+        self.on_stage: Callable[[str], object] = lambda words: None
+        five = {name: getattr(self.robot, name) for name in ("joints", "opening", "move", "grip", "image")}
+        self.grasper = Grasper(
+            SimpleNamespace(**five),
+            lambda image: self.perception(image),
+            program(eyes).planner,
+            self.rest,
+            self.scene.bins.values(),
+            *second,
+            on_stage=self.tell,
+        )
+
+    def tell(self, words: str) -> None:
+        self.said.append(words)
+        self.on_stage(words)
+
+    def absent(self) -> str:
+        return next(name for name in CLASS_NAMES if name not in self.names)
+
+    def held(self) -> set[str]:
+        """Classes of what is lifted, and still is after 2 s."""
+        before = self.scene.lifted()
+        self.robot.move(np.array([2.0]), self.robot.joints()[None])
+        return {name for name, up in zip(self.names, before & self.scene.lifted(), strict=True) if up}
+
+    def remove(self, name: str) -> None:
+        """Take all objects of a class off the table."""
+        model, data = self.scene.model, self.scene.data
+        for i, other in enumerate(self.names):
+            if other == name:
+                first = model.jnt_qposadr[model.body(f"object {i}").jntadr[0]]
+                data.qpos[first : first + 2] = [5 + i, 5]
+
+    def at_rest(self) -> bool:
+        return np.abs(self.robot.joints() - self.rest).max() < 0.01 and not self.scene.lifted().any()
+
+
+@pytest.mark.parametrize("eyes", EYES)
+@pytest.mark.parametrize("number", [0, 1, 2, 4])
+def test_what_is_asked_for_is_lifted_and_held(number: int, eyes: Eyes):
+    bench = Bench(number, eyes)
+    asked = bench.names[number % len(bench.names)]
+    outcome = bench.grasper.pick(asked)
+    assert outcome.success and outcome.stage == "done" and not outcome.reason
+    assert bench.held() == {asked}
+    truth = bench.scene.start[[name == asked for name in bench.names]]
+    assert np.linalg.norm(truth - outcome.position, axis=1).min() < 0.006
+    assert bench.said[0] == "look" and bench.said[-2:] == [f"grasp the {asked}", "lift"]
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_what_is_not_there_is_said_not_to_be(eyes: Eyes):
+    bench = Bench(0, eyes)
+    outcome = bench.grasper.pick(bench.absent())
+    assert outcome.stage == "see" and not outcome.success
+    assert bench.said == {"truth": ["look"], "camera": ["look", "look again"]}[eyes]
+    assert outcome.reason == f"no {bench.absent()} is seen"
+    assert bench.at_rest() and not bench.held()
+    with_moon = said(lambda: bench.grasper.pick("moon"))
+    assert with_moon == f"no class 'moon': the detector knows {', '.join(CLASS_NAMES)}"
+
+
+def test_what_is_out_of_reach_or_not_located_is_said_to_be():
+    bench, far = Bench(0, "truth"), np.array([0.5, 0.0, 0.0125])
+    for seen, stage, reason in (
+        (SeenObject("red cube", 1.0, far, 0.0), "reach", "the red cube is there, but out of reach"),
+        (SeenObject("red cube", 1.0, None, np.nan, "it is above the horizon"), "locate", "it is above the horizon"),
+    ):
+        bench.perception = lambda _, seen=seen: [seen]
+        outcome = bench.grasper.pick("red cube")
+        assert outcome.stage == stage and reason in outcome.reason and outcome.attempts == 1
+        assert bench.at_rest()
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_it_is_put_into_a_bin(eyes: Eyes):
+    bench = Bench(1, eyes)
+    for name in ("dumbbell", "can"):
+        assert bench.grasper.pick(name).success
+        assert bench.grasper.place(bin=name).success
+        assert bench.at_rest()
+        assert bench.scene.in_bin(name)[bench.names.index(name)]
+    assert "dumbbell" not in {one.name for one in bench.grasper.look()}, "what lies in a bin is done with"
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_it_is_put_down_where_it_should_be(eyes: Eyes):
+    bench = Bench(2, eyes)
+    near = lambda point: np.linalg.norm(bench.scene.start[:, :2] - point, axis=1).min()
+    angles = np.linspace(-1.4, 1.4, 30)
+    point = max(0.18 * np.stack([np.cos(angles), np.sin(angles)], 1), key=near)
+    for name in ("red cube", "brick"):
+        assert bench.grasper.pick(name).success
+        assert bench.grasper.place(point).success
+        position = bench.scene.object_poses()[0][bench.names.index(name), :2]
+        assert np.linalg.norm(position - point) <= 0.010
+        assert bench.at_rest() and bench.scene.resting().all()
+        point = point * 0.72
+
+
+def test_what_cannot_be_placed_is_still_held():
+    bench = Bench(2, "truth")
+    nothing = "nothing is held: pick something first"
+    assert said(lambda: bench.grasper.place(np.array([0.2, 0.0]))) == nothing
+    assert bench.grasper.pick("red cube").success
+    assert said(lambda: bench.grasper.place(bin="moon")).startswith("no bin 'moon': there are red cube, ")
+    for both in ({}, {"point": np.zeros(2), "bin": "can"}):
+        assert said(lambda both=both: bench.grasper.place(**both)) == "place takes a point or the name of a bin"
+    outcome = bench.grasper.place(np.array([0.6, 0.0]))
+    assert outcome.stage == "place" and outcome.reason == "the place is out of reach"
+    assert bench.held() == {"red cube"}
+    assert bench.grasper.place(bin="red cube").success
+    assert said(lambda: bench.grasper.place(bin="red cube")) == nothing
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_fingers_that_close_on_nothing_feel_it(eyes: Eyes):
+    """The object is gone when the arm comes, and the next image shows it."""
+    bench = Bench(4, eyes)
+    name = bench.names[0]
+    bench.on_stage = lambda words: words == f"grasp the {name}" and bench.remove(name)
+    outcome = bench.grasper.pick(name)
+    assert "give up: the fingers closed on nothing" in bench.said
+    assert outcome.stage == {"truth": "reach", "camera": "see"}[eyes] and outcome.attempts > 1
+    assert bench.at_rest() and not bench.held()
+
+
+def test_it_gives_up_after_several_images():
+    """Here the camera shows for ever what is no longer there."""
+    bench = Bench(4, "truth")
+    name, seen = bench.names[0], bench.perception(bench.robot.image())
+    bench.remove(name)
+    bench.perception = lambda _: seen
+    outcome = bench.grasper.pick(name)
+    assert outcome.stage == "grip" and outcome.attempts == ATTEMPTS and not outcome.success
+    assert outcome.reason == "the fingers closed on nothing"
+    assert bench.said.count("look") == ATTEMPTS and bench.said[-1] == "rest"
+    assert bench.at_rest() and not bench.held()
+
+
+def test_an_object_lost_on_the_way_up_is_noticed():
+    bench = Bench(0, "truth")
+    name = bench.names[0]
+    bench.on_stage = lambda words: words == "lift" and bench.remove(name)
+    outcome = bench.grasper.pick(name)
+    assert "give up: the object was lost on the way up" in bench.said
+    assert outcome.stage == "reach" and bench.at_rest()
+
+
+def test_an_object_lost_on_the_way_to_its_place_is_noticed():
+    bench = Bench(0, "truth")
+    assert bench.grasper.pick(bench.names[0]).success
+    bench.remove(bench.names[0])
+    outcome = bench.grasper.place(bin=bench.names[0])
+    assert outcome.stage == "lift" and outcome.reason == "the object was lost on the way" and bench.at_rest()
+    assert "nothing is held" in said(lambda: bench.grasper.place(bin="can"))
+
+
+def test_a_dry_run_is_told_what_an_arm_would_be():
+    """It needs no simulator, only what is seen."""
+    planner = program("truth").planner
+    arm, seen = planner.arm, SeenObject("ball", 0.9, np.array([0.17, -0.08, 0.015]), 0.001)
+    perception: Perception = lambda _: [seen]
+    robot = DryRun(arm, arm.home, image=np.zeros((4, 4, 3), np.uint8))
+    grasper = Grasper(robot, perception, planner, arm.home)
+    assert grasper.pick("ball").success
+    assert grasper.place(np.array([0.12, 0.12])).success
+    times = np.array([one.time for one in robot.commands])
+    joints = np.array([one.joints for one in robot.commands])
+    assert (np.diff(times) >= 0).all() and times[-1] < 60
+    assert (joints >= arm.lower - 1e-5).all() and (joints <= arm.upper + 1e-5).all()
+    speeds = np.abs(np.diff(joints, axis=0)).max(1)[np.diff(times) > 0] / np.diff(times)[np.diff(times) > 0]
+    assert speeds.max() < 1.51
+    np.testing.assert_array_equal(joints[-1], arm.home)
