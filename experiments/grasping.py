@@ -3,6 +3,7 @@
 python experiments/grasping.py                    every row on 1,000 scenes (100 where disturbed), into results/
 python experiments/grasping.py --scenes 50        quicker; nothing is written
 python experiments/grasping.py --rows "from pixels" "ground truth"
+python experiments/grasping.py --figure docs/grasp.png
 """
 
 from __future__ import annotations
@@ -13,13 +14,17 @@ import platform
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from arm5dof.grasp.evaluation import Setting, evaluate
+from arm5dof.grasp.evaluation import Program, Setting, evaluate
+from arm5dof.grasp.grasper import Grasper
+from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import Disturbance
 from arm5dof.grasp.shipped import ARMS
 from arm5dof.runtime import files, xla
 from arm5dof.runtime.progress import Bar
+from arm5dof.vision.io.annotate import annotate
 
 RESULTS = Path(__file__).parent / "results"
 SEED = 2026
@@ -52,8 +57,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, help="of every row; nothing is written unless --rows names some")
     parser.add_argument("--rows", nargs="+", choices=ROWS, help="only these; others stay in the results as they are")
+    parser.add_argument("--figure", type=Path, help="only draw one grasp, before and after")
     arguments = parser.parse_args()
     xla.enable_compilation_cache()
+    if arguments.figure:
+        figure(arguments.figure)
+        return
     path = RESULTS / "grasping.json"
     found = json.loads(path.read_text()) if path.exists() else {}
     for name in arguments.rows or ROWS:
@@ -67,13 +76,27 @@ def main() -> None:
             files.write_text(RESULTS / "grasping.md", markdown(found))
 
 
+def figure(path: Path) -> None:
+    """What the camera sees of one scene, what is detected in it, and the object lifted."""
+    program = Program(PAPER)
+    scene = program.scene(7)
+    robot, (eyes, _) = SimulatedRobot(scene), program.perceptions(scene)
+    before = robot.image()
+    grasper = Grasper(robot, eyes, program.planner, robot.joints(), scene.bins.values())
+    seen = annotate(before, program.detectors[0](before))
+    name = next(one.name for one in grasper.look() if one.position is not None)
+    print(name, grasper.pick(name))
+    with files.replacing(path) as temporary:
+        cv2.imwrite(str(temporary), np.hstack([seen, robot.image()])[..., ::-1])
+
+
 def markdown(found: dict[str, dict]) -> str:
     """A row for each setting."""
     lines = [
         "# Grasping: one object of a random class that is there, lifted by 5 cm and held for 2 s",
         "",
         f"Command: `python experiments/grasping.py`, seed {SEED}. {platform.machine()} CPU. Success is of the",
-        "requests that the arm can reach and of which the camera sees half or more; in brackets, of all that it can reach.",
+        "requests that the arm can reach and of which the camera sees half or more; in brackets, of all it can reach.",
         "",
         "| | scenes | success | another object lifted | lost by |",
         "| --- | ---: | ---: | ---: | --- |",

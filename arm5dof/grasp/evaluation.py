@@ -171,7 +171,7 @@ class Program:
             checked_place(setting.place)
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
-        self._detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []
+        self.detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []
 
     def scene(self, number: int) -> TabletopScene:
         """A random scene, the arm at rest out of the camera's way."""
@@ -189,8 +189,8 @@ class Program:
 
     def perceptions(self, scene: TabletopScene) -> list[Perception]:
         """What is seen of a scene, at the first look and at the second."""
-        if self._detectors:
-            return [CameraPerception(detector, scene.camera) for detector in self._detectors]
+        if self.detectors:
+            return [CameraPerception(detector, scene.camera) for detector in self.detectors]
         return [partial(_true, scene)]
 
     def trial(self, number: int, watch: Callable[[TabletopScene, Perception], Observer] | None = None) -> Trial:
