@@ -1,6 +1,6 @@
 """How often grasping works, from pixels and with ground truth, under disturbances, and where requests are lost.
 
-python experiments/grasping.py                    every row on 1,000 scenes (100 where disturbed), into results/
+python experiments/grasping.py                    every row on 1,000 scenes (100 if disturbed or sorted): results/
 python experiments/grasping.py --scenes 50        quicker; nothing is written
 python experiments/grasping.py --rows "from pixels" "ground truth"
 python experiments/grasping.py --figure docs/grasp.png
@@ -19,12 +19,14 @@ import numpy as np
 
 from arm5dof.grasp.evaluation import Program, Setting, evaluate
 from arm5dof.grasp.grasper import Grasper
+from arm5dof.grasp.jobs import Step
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import Disturbance
 from arm5dof.grasp.shipped import ARMS
 from arm5dof.runtime import files, xla
 from arm5dof.runtime.progress import Bar
 from arm5dof.vision.io.annotate import annotate
+from arm5dof.vision.synthetic.scenes import MAX_OBJECTS
 
 RESULTS = Path(__file__).parent / "results"
 SEED = 2026
@@ -42,6 +44,9 @@ ROWS = {
     "from pixels": PAPER,
     "ground truth": replace(PAPER, eyes="truth"),
     "from pixels, into the bin of its class": replace(PAPER, bin="class"),
+    "six objects sorted into bins, from pixels": replace(
+        PAPER, job=(Step("any", bin="class"),), count=(MAX_OBJECTS, MAX_OBJECTS)
+    ),
     "seven joints, from pixels": SEVEN,
     "seven joints, ground truth": replace(SEVEN, eyes="truth"),
     "camera moved 5 mm and 1 degree": replace(
@@ -66,8 +71,8 @@ def main() -> None:
     path = RESULTS / "grasping.json"
     found = json.loads(path.read_text()) if path.exists() else {}
     for name in arguments.rows or ROWS:
-        disturbed = ROWS[name].disturbance != Disturbance()
-        scenes = arguments.scenes or (100 if disturbed else 1000)
+        long = ROWS[name].disturbance != Disturbance() or ROWS[name].job
+        scenes = arguments.scenes or (100 if long else 1000)
         with Bar(name, scenes, "scenes") as bar:
             found[name] = evaluate(ROWS[name], scenes, bar.update).as_json()
         print(name, json.dumps(found[name]))
