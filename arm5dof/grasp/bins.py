@@ -37,6 +37,11 @@ class Bin:
     yaw: float
     """About z, radians."""
 
+    @property
+    def room(self) -> float:
+        """From its middle to a wall, metres."""
+        return HALF - WALL
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Whether points (n, 3), metres, base frame, lie between its walls and hardly above them, (n,) bool."""
         along = np.array([np.cos(self.yaw), np.sin(self.yaw)])

@@ -95,6 +95,7 @@ class Grasper:
         self._objects: list[SeenObject] = []
         self._held: CatalogueObject | None = None
         self._from: np.ndarray | None = None
+        self._filled: dict[str, int] = {}
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self, again: bool = False) -> list[SeenObject]:
@@ -105,7 +106,8 @@ class Grasper:
         return [one for one in seen if one.position is None or not self._in_a_bin(one.position)]
 
     def _in_a_bin(self, position: np.ndarray) -> bool:
-        return any(one.contains(position[None])[0] for one in self.bins.values())
+        flat = np.append(position[:2], 0.0)  # What lies on something else in there is in it too.
+        return any(one.contains(flat[None])[0] for one in self.bins.values())
 
     def pick(self, name: str) -> Outcome:
         """Pick up an object of a class and hold it, `CLEARANCE` above where it was.
@@ -161,11 +163,18 @@ class Grasper:
             assert below.position is not None
             where, height = below.position[:2], 2 * below.position[2] + self._held.half_height + DROP
         elif bin is not None:
-            where, height = self.bins[bin].position, self._held.half_height + BIN_HEIGHT
+            where, height = self._free(self.bins[bin]), self._held.half_height + BIN_HEIGHT
         else:
             assert point is not None
             where, height = checked_place(point), self._held.half_height + DROP
         return self._put(where, height)
+
+    def _free(self, bin: Bin) -> np.ndarray:
+        """Where in a bin to put what is held: the first on one side, the next on the other."""
+        assert self._held is not None
+        count = self._filled[bin.name] = self._filled.get(bin.name, 0) + 1
+        aside = max(0.0, bin.room - self._held.radius) * (1 if count % 2 else -1)
+        return bin.position + aside * np.array([-np.sin(bin.yaw), np.cos(bin.yaw)])
 
     def put_back(self) -> Outcome:
         """Put down what is held where it was picked up, and go to rest."""

@@ -26,6 +26,8 @@ from arm5dof.grasp.grasper import Grasper, Outcome, checked_place
 from arm5dof.vision.objects import CLASS_NAMES
 
 ANY, CLASS = "any", "class"
+MOST = 20
+"""Objects that one step moves: what is seen again and again is not there."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,10 @@ def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
             done.append(Done(step.pick, _move(grasper, step.pick, step)))
             continue
         hopeless: set[str] = set()
-        while names := [name for name in _seen(grasper) if name not in hopeless]:
+        for _ in range(MOST):
+            names = [name for name in _seen(grasper) if name not in hopeless]
+            if not names:
+                break
             done.append(Done(names[0], _move(grasper, names[0], step)))
             if not done[-1].outcome.success:
                 hopeless.add(names[0])
