@@ -223,7 +223,7 @@ class Grasper:
     ) -> Outcome:
         self._say(f"give up: {reason}")
         self._held = None
-        self.robot.grip(self._widest / 2)
+        self.robot.grip(min(max(self._widest / 2, self.robot.opening() + SLACK), self._widest))
         if np.abs(self.robot.joints() - way.line[-1]).max() < np.abs(self.robot.joints() - way.line[0]).max():
             self._retreat(way)
         self._go_to_rest()

@@ -77,7 +77,7 @@ def can(x: float, y: float) -> SeenObject:
 def test_approaches_are_straight_and_on_one_branch():
     arm, world, found = gripping_arm(), World(gripping_arm()), 0
     start = np.array([0.3, -0.4, np.pi / 2, 0.2, -0.5])
-    for point in places(0, 60):
+    for point in places(0, 40):
         way = planner().approach(world, start, point, CLEARANCE, OPENING)
         if isinstance(way, str):
             assert way in ("out of reach", "would collide")
@@ -97,7 +97,7 @@ def test_approaches_are_straight_and_on_one_branch():
         for path in (way.line, way.transit):
             assert (path >= arm.lower - 1e-5).all() and (path <= arm.upper + 1e-5).all()
             assert world.clear(path, OPENING, allowed=ALLOWED[-1])
-    assert found >= 57
+    assert found >= 38
 
 
 def test_the_policy_solves_what_the_closed_form_solves():
