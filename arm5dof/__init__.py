@@ -15,12 +15,14 @@ _HOMES = {
     "Camera": "arm5dof.vision.camera",
     "Config": "arm5dof.training.config",
     "Detections": "arm5dof.vision.detections",
+    "Grasper": "arm5dof.grasp.grasper",
     "Policy": "arm5dof.training.policy",
     "Run": "arm5dof.training.run",
     "Task": "arm5dof.envs",
     "load_arm": "arm5dof.arm",
     "load_config": "arm5dof.training.config",
     "load_detector": "arm5dof.vision.detectors.loading",
+    "load_policy": "arm5dof.training.policy_file",
     "locate": "arm5dof.vision.localization",
     "make_env": "arm5dof.training.config",
     "train": "arm5dof.training.run",
@@ -32,10 +34,12 @@ if TYPE_CHECKING:
     from arm5dof.arm import Arm as Arm
     from arm5dof.arm import load_arm as load_arm
     from arm5dof.envs import Task as Task
+    from arm5dof.grasp.grasper import Grasper as Grasper
     from arm5dof.training.config import Config as Config
     from arm5dof.training.config import load_config as load_config
     from arm5dof.training.config import make_env as make_env
     from arm5dof.training.policy import Policy as Policy
+    from arm5dof.training.policy_file import load_policy as load_policy
     from arm5dof.training.run import Run as Run
     from arm5dof.training.run import train as train
     from arm5dof.vision.camera import Camera as Camera

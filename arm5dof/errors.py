@@ -1,8 +1,24 @@
 """The one exception that users cause and can mend."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class UserError(Exception):
     """Bad input. Its text is one line: what is wrong and what to do. The command line prints it and exits with 2."""
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(message.split()))
+
+
+def nearest(name: str, valid: Iterable[str]) -> str | None:
+    """The valid name that is most like another, if any is."""
+    return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
+
+
+def nearest_hint(name: str, valid: Iterable[str]) -> str:
+    """What to say of a name that is none of the valid ones."""
+    near = nearest(name, valid)
+    return f"did you mean {near!r}?" if near else f"valid are {', '.join(valid)}"

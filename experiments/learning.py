@@ -74,10 +74,7 @@ ABLATIONS = {
 TEN_SEEDS = ("100 episodes, kinematic",)
 """Rows where a lottery would show."""
 
-POSES = {
-    "five joints, approach": "reach_pose.toml",
-    "seven joints, rotation": "reach_pose7.toml",
-}
+POSES = {"five joints, approach": "reach_pose.toml"}
 
 TABLES = {"budgets": BUDGETS, "ablations": ABLATIONS, "poses": POSES}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,8 @@ camera's image alone.
   arm5dof grasp --pick "red cube" --bin "red cube" --video grasp.mp4
   arm5dof grasp --pick ball --place 0.15 -0.1       put it down there, metres in the arm's base frame
   arm5dof grasp --scenes 1000 --seed 3 --json       how often it works, and where requests are lost
+  arm5dof grasp --task sort.toml                    several picks and places: [[step]] with pick = a class or "any",
+                                                    and bin = a name or "class", place = [x, y], or on = a class
   arm5dof grasp --scenes 1000 --eyes truth          the same, had the camera seen everything right
   arm5dof grasp --arm arm7_gripper.xml              another arm that ships
   arm5dof grasp --arm mine.xml --policy runs/mine   another arm: a policy trained by
@@ -47,6 +50,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     where.add_argument(
         "--bin", metavar="NAME", help='the bin to put it in, named after a class; "class": that of its own'
     )
+    p.add_argument("--task", type=Path, metavar="FILE", help="steps in TOML, instead of --pick, --place and --bin")
     p.add_argument("--arm", default="arm5.xml", metavar="FILE", help="MJCF with a gripper; default arm5.xml")
     p.add_argument("--policy", type=Path, metavar="RUN", help="a run's folder or a policy's file; default: what ships")
     p.add_argument(
@@ -73,6 +77,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
         from arm5dof.cli.vision.options import writable
 
         writable(args.video, (".mp4",))
+    if args.task is not None and (args.pick or args.place or args.bin or args.image):
+        raise UserError("--task says what to pick and where to put it: leave out --pick, --place, --bin and --image")
     from arm5dof.grasp.shipped import ARMS, shipped
 
     policy = args.policy or shipped(args.arm).policy
@@ -84,6 +90,10 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
     radii = tuple(args.radii) if args.radii else ARMS.get(args.arm, ARMS["arm5.xml"]).radii
     place = tuple(args.place) if args.place else None
     setting = Setting(policy, args.arm, radii, args.seed, args.eyes, args.pick, place, args.bin)
+    if args.task is not None:
+        from arm5dof.grasp.jobs import read_job
+
+        setting = replace(setting, job=tuple(read_job(args.task)))
     if args.scenes == 1 or args.video is not None:
         trial = _watched(Program(setting), args.video, quiet=args.json)
     if args.scenes > 1:

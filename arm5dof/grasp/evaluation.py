@@ -19,6 +19,7 @@ from arm5dof.arm import load_arm
 from arm5dof.errors import UserError
 from arm5dof.grasp.grasper import CLEARANCE, Grasper, Outcome, checked_place
 from arm5dof.grasp.gripper import SITE
+from arm5dof.grasp.jobs import ANY, CLASS, Step, perform
 from arm5dof.grasp.perception import CameraPerception, Perception, SeenObject
 from arm5dof.grasp.planner import Planner
 from arm5dof.grasp.robot import SimulatedRobot
@@ -65,6 +66,10 @@ class Setting:
     bin: str | None = None
     """Or the bin in which it is put; "class" for that of its class."""
     disturbance: Disturbance = UNDISTURBED
+    job: tuple[Step, ...] = ()
+    """What is to be done instead of one pick."""
+    count: tuple[int, int] = (3, MAX_OBJECTS)
+    """The least and the greatest number of objects."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,8 @@ class Trial:
     """Where it was lost, empty if it was not."""
 
 
+LOST_BY = {"see": "missed", "locate": "missed", "reach": "policy", "collide": "collision", "place": "place"}
+"""By the stage at which a request ended, where that is all that is known."""
 LOST = ("missed", "wrong class", "localization", "policy", "collision", "grip", "place")
 """Where requests are lost."""
 
@@ -171,7 +178,7 @@ class Program:
             checked_place(setting.place)
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
-        self._detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []
+        self.detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []
 
     def scene(self, number: int) -> TabletopScene:
         """A random scene, the arm at rest out of the camera's way."""
@@ -181,7 +188,7 @@ class Program:
             (s.seed, number),
             arm=s.arm,
             radii=s.radii,
-            count=(3, MAX_OBJECTS),
+            count=s.count,
             disturbance=s.disturbance,
         )
         seen = build()
@@ -189,8 +196,8 @@ class Program:
 
     def perceptions(self, scene: TabletopScene) -> list[Perception]:
         """What is seen of a scene, at the first look and at the second."""
-        if self._detectors:
-            return [CameraPerception(detector, scene.camera) for detector in self._detectors]
+        if self.detectors:
+            return [CameraPerception(detector, scene.camera) for detector in self.detectors]
         return [partial(_true, scene)]
 
     def trial(self, number: int, watch: Callable[[TabletopScene, Perception], Observer] | None = None) -> Trial:
@@ -201,6 +208,8 @@ class Program:
             watch: Makes what is told how it goes.
         """
         s, scene = self.setting, self.scene(number)
+        if s.job:
+            return self._job(number, scene, watch)
         first, *second = self.perceptions(scene)
         observer = watch(scene, first) if watch is not None else Observer()
         names = [one.catalogue_object.name for one in scene.objects]
@@ -228,6 +237,24 @@ class Program:
         success = held and placed if reachable else not outcome.success and not wrong
         lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
         return Trial(number, asked, reachable, in_sight, success, wrong, lost)
+
+    def _job(
+        self, number: int, scene: TabletopScene, watch: Callable[[TabletopScene, Perception], Observer] | None
+    ) -> Trial:
+        """Do the job, and see what it left behind."""
+        first, *second = self.perceptions(scene)
+        observer = watch(scene, first) if watch is not None else Observer()
+        seen = _visible(scene) if self.detectors else set(range(len(scene.objects)))
+        there = [i for i in sorted(seen) if self._reachable(scene, i)]
+        robot = SimulatedRobot(scene, on_step=observer.step)
+        first, look_again = observer.perception or first, second[0] if second else None
+        bins = scene.bins.values()
+        grasper = Grasper(robot, first, self.planner, robot.joints(), bins, look_again, observer.stage)
+        done = perform(grasper, self.setting.job)
+        success = all(_met(step, scene, there) for step in self.setting.job)
+        stages = [one.outcome.stage for one in done if not one.outcome.success]
+        lost = "" if success else LOST_BY.get(stages[0], "grip") if stages else "missed"
+        return Trial(number, "job", True, True, success, False, lost)
 
     def _reachable(self, scene: TabletopScene, i: int) -> bool:
         world = World(self.planner.arm)
@@ -258,14 +285,34 @@ def _at_rest(scene: TabletopScene, which: int, place: Sequence[float] | None, bi
     return bool(np.hypot(*away) <= NEAR and scene.resting()[which])
 
 
+def _met(step: Step, scene: TabletopScene, there: list[int]) -> bool:
+    """Whether a scene is as a step should have left it; `there` are the objects that could be seen and reached."""
+    places, rests = scene.object_poses()[0], scene.resting()
+    kinds = [one.catalogue_object for one in scene.objects]
+    if step.pick == ANY:
+        bins = [kinds[i].name if step.bin == CLASS else str(step.bin) for i in there]
+        return all(scene.in_bin(bin)[i] for i, bin in zip(there, bins, strict=True))
+    mine = [i for i, kind in enumerate(kinds) if kind.name == step.pick and rests[i]]
+    if step.bin is not None:
+        return any(scene.in_bin(step.pick if step.bin == CLASS else step.bin)[i] for i in mine)
+    if step.place is not None:
+        return any(np.hypot(*(places[i, :2] - step.place)) <= NEAR for i in mine)
+    below = [i for i, kind in enumerate(kinds) if kind.name == step.on]
+    return any(
+        np.hypot(*(places[i] - places[j])[:2]) <= kinds[j].radius
+        and abs((places[i] - places[j])[2] - kinds[i].half_height - kinds[j].half_height) < 0.003
+        for i in mine
+        for j in below
+        if i != j
+    )
+
+
 def _lost(outcome: Outcome, held: bool, wrong: bool, scene: TabletopScene, names: list[str], asked: str) -> str:
     """Where a request was lost: the first stage that was wrong."""
     if wrong:
         return "wrong class"
-    if outcome.stage in ("see", "locate"):
-        return "missed"
-    if outcome.stage in ("reach", "collide"):
-        return "policy" if outcome.stage == "reach" else "collision"
+    if outcome.stage in LOST_BY:
+        return LOST_BY[outcome.stage]
     if held:
         return "place"
     places = scene.start[[name == asked for name in names]]

@@ -94,6 +94,7 @@ class Grasper:
         self._second, self._say = second_look, on_stage
         self._objects: list[SeenObject] = []
         self._held: CatalogueObject | None = None
+        self._from: np.ndarray | None = None
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self, again: bool = False) -> list[SeenObject]:
@@ -131,27 +132,48 @@ class Grasper:
             again = unseen or outcome.stage == "collide"
         return outcome
 
-    def place(self, point: np.ndarray | None = None, bin: str | None = None) -> Outcome:
+    def place(
+        self, point: Sequence[float] | np.ndarray | None = None, bin: str | None = None, on: str | None = None
+    ) -> Outcome:
         """Put down what was picked up, and go to rest.
 
         Args:
             point: Where on the table, (2,), metres, base frame.
             bin: Or the name of a bin.
+            on: Or on an object of this class that was seen when this one was picked.
 
         Returns:
-            What came of it. Unless it is `done` the arm still holds the object.
+            What came of it. Unless it is `done` or the object is lost the arm still holds it: see `put_back`.
 
         Raises:
-            UserError: Nothing is held, there is no such bin, the point is none, or not one of the two was given.
+            UserError: Nothing is held, there is no such bin, the point is none, or not one of the three was given.
         """
-        if (point is None) == (bin is None):
-            raise UserError("place takes a point or the name of a bin")
+        if sum(value is not None for value in (point, bin, on)) != 1:
+            raise UserError("place takes a point, the name of a bin, or the class of what it is put on")
         if bin is not None and bin not in self.bins:
             raise UserError(f"no bin {bin!r}: there are {', '.join(self.bins) or 'none'}")
         if self._held is None:
             raise UserError("nothing is held: pick something first")
-        where = checked_place(point) if point is not None else self.bins[str(bin)].position
-        height = self._held.half_height + (BIN_HEIGHT if bin is not None else DROP)
+        if on is not None:
+            below = next((one for one in self._objects if one.name == on), None)
+            if below is None:
+                return Outcome("see", f"no {on} is seen to put it on")
+            assert below.position is not None
+            where, height = below.position[:2], 2 * below.position[2] + self._held.half_height + DROP
+        elif bin is not None:
+            where, height = self.bins[bin].position, self._held.half_height + BIN_HEIGHT
+        else:
+            assert point is not None
+            where, height = checked_place(point), self._held.half_height + DROP
+        return self._put(where, height)
+
+    def put_back(self) -> Outcome:
+        """Put down what is held where it was picked up, and go to rest."""
+        if self._held is None or self._from is None:
+            raise UserError("nothing is held: pick something first")
+        return self._put(self._from, self._held.half_height + DROP)
+
+    def _put(self, where: np.ndarray, height: float) -> Outcome:
         self._say(f"place at {1e3 * where[0]:.0f} {1e3 * where[1]:.0f} mm")
         opening = self.robot.opening()
         way = self._approach(np.append(where, height), opening)
@@ -198,6 +220,7 @@ class Grasper:
         return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without, self._met)
 
     def _grasp(self, way: Approach, target: SeenObject, kind: CatalogueObject, opening: float, attempt: int) -> Outcome:
+        assert target.position is not None
         self._say(f"grasp the {target.name}")
         self.robot.grip(opening)
         self._go(way)
@@ -215,7 +238,7 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
         self._objects = [one for one in self._objects if one is not target]
-        self._held = kind
+        self._held, self._from = kind, target.position[:2]
         return Outcome("done", attempts=attempt, position=target.position)
 
     def _give_up(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import functools
 import importlib
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -22,7 +21,7 @@ from pydantic import TypeAdapter
 
 from arm5dof.ddpg import DDPGConfig
 from arm5dof.envs import Task
-from arm5dof.errors import UserError
+from arm5dof.errors import UserError, nearest, nearest_hint
 from arm5dof.runtime import files
 from arm5dof.training.evaluate import EvaluateConfig
 from arm5dof.training.trainer import TrainConfig
@@ -141,7 +140,7 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
     try:
         for section, given in values.items():
             if section not in SECTIONS:
-                raise UserError(f"unknown section {section!r}: {_hint(section, SECTIONS)}")
+                raise UserError(f"unknown section {section!r}: {nearest_hint(section, SECTIONS)}")
             if not isinstance(given, Mapping):
                 raise UserError(f"{section} = {given!r}: it should be a section [{section}]")
         task = values.get("env", {}).get("task", "reach")
@@ -238,7 +237,7 @@ def find(name: str, known: list[Field]) -> Field:
         raise UserError(f"{name!r} is {' or '.join(f'{f.section}.{f.name}' for f in matching)}: name the section too")
     if not matching:
         names = [key for f in known for key in (f.name, f"{f.section}.{f.name}")]
-        raise UnknownSettingError(name, _nearest(wanted, names))
+        raise UnknownSettingError(name, nearest(wanted, names))
     return matching[0]
 
 
@@ -255,7 +254,7 @@ def _section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
     names = [f.name for f in dataclasses.fields(cls)]
     for key in values:
         if key not in names:
-            raise UserError(f"unknown key '{name}.{key}': {_hint(key, names)}")
+            raise UserError(f"unknown key '{name}.{key}': {nearest_hint(key, names)}")
     try:
         return cls(**values)
     except UserError as error:
@@ -315,14 +314,3 @@ def _parse(value: Any, default: Any) -> Any:
         with contextlib.suppress(ValueError):
             return number(value)
     return value
-
-
-def _hint(name: str, valid: Iterable[str]) -> str:
-    """What to say of a name that is none of the valid ones."""
-    near = _nearest(name, valid)
-    return f"did you mean {near!r}?" if near else f"valid are {', '.join(valid)}"
-
-
-def _nearest(name: str, valid: Iterable[str]) -> str | None:
-    """The valid name that is most like another, if any is."""
-    return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
