@@ -155,7 +155,9 @@ def test_what_cannot_be_placed_is_still_held():
     assert bench.grasper.pick("red cube").success
     assert said(lambda: bench.grasper.place(bin="moon")).startswith("no bin 'moon': there are red cube, ")
     for both in ({}, {"point": np.zeros(2), "bin": "can"}):
-        assert said(lambda both=both: bench.grasper.place(**both)) == "place takes a point or the name of a bin"
+        assert said(lambda both=both: bench.grasper.place(**both)) == (
+            "place takes a point, the name of a bin, or the class of what it is put on"
+        )
     outcome = bench.grasper.place(np.array([0.6, 0.0]))
     assert outcome.stage == "place" and outcome.reason == "the place is out of reach"
     assert bench.held() == {"red cube"}

@@ -139,6 +139,16 @@ def test_what_is_walled_in_is_not_approached():
     assert isinstance(ask([can(*point[:2])], without=0), Approach)
 
 
+def test_directions_that_met_something_are_avoided():
+    arm, point = gripping_arm(), np.array([0.15, 0.1, 0.02])
+    ask = lambda avoid: planner().approach(World(arm), arm.home, point, CLEARANCE, OPENING, avoid=avoid)
+    met: list[np.ndarray] = []
+    while not isinstance(way := ask(met), str):
+        assert all(degrees(way.direction, other) >= 11.99 for other in met)
+        met.append(way.direction)
+    assert way == "would collide" and 2 < len(met) < 20
+
+
 def test_transits_go_around():
     """A tower of cans stands where the straight path between two poses leads; there is another."""
     arm = gripping_arm()
