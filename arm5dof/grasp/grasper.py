@@ -77,6 +77,20 @@ class Grasper:
         bins: By name.
         second_look: What is asked where `perception` does not see what it should; slower and surer.
         on_stage: Called with a few words whenever it begins something, such as for a video.
+
+    >>> import numpy as np
+    >>> from arm5dof import Grasper, load_arm
+    >>> from arm5dof.grasp.perception import SeenObject
+    >>> from arm5dof.grasp.planner import Planner
+    >>> from arm5dof.grasp.robot import DryRun
+    >>> from arm5dof.grasp.shipped import shipped
+    >>> from arm5dof.training.policy_file import load_policy
+    >>> arm = load_arm("arm5.xml", site="grasp")
+    >>> robot = DryRun(arm, image=np.zeros((480, 640, 3), np.uint8))  # Moves nothing and keeps what it was told.
+    >>> planner = Planner(load_policy(shipped("arm5.xml").policy), arm)
+    >>> perception = lambda image: [SeenObject("can", 0.9, np.array([0.18, 0.05, 0.02]), 0.001)]
+    >>> Grasper(robot, perception, planner, arm.home).pick("can").stage
+    'done'
     """
 
     def __init__(
@@ -255,7 +269,7 @@ class Grasper:
     ) -> Outcome:
         self._say(f"give up: {reason}")
         self._held = None
-        self.robot.grip(self._widest / 2)
+        self.robot.grip(min(max(self._widest / 2, self.robot.opening() + SLACK), self._widest))
         if np.abs(self.robot.joints() - way.line[-1]).max() < np.abs(self.robot.joints() - way.line[0]).max():
             self._retreat(way)
         self._go_to_rest()

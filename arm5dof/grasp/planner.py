@@ -100,8 +100,6 @@ class Planner:
             The way, or why there is none.
         """
         directions = _directions(point)
-        tried = [(directions @ other > np.cos(AVOIDED)) for other in avoid]
-        directions = directions[~np.any(tried, 0)] if tried else directions
         along = np.linspace(clearance, 0, POINTS) / -directions[:, 2:]
         targets = point - directions[:, None] * along[..., None]
         answer = self.policy.solve(
@@ -121,6 +119,8 @@ class Planner:
             return "out of reach"
         if not checked:
             return Approach(ways[0][1][:1], ways[0][1], ways[0][0])
+        # Only now: another number of goals would be another program to compile.
+        ways = [way for way in ways if all(way[0] @ other <= np.cos(AVOIDED) for other in avoid)]
         for allowed in ALLOWED:
             for direction, line in ways:
                 if world.clear(line, opening, without, allowed):

@@ -63,6 +63,12 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         UserError: It is neither, or damaged.
+
+    >>> import arm5dof
+    >>> from pathlib import Path
+    >>> policy = arm5dof.load_policy(Path(arm5dof.__file__).parent / "grasp" / "policies" / "arm5.zip")
+    >>> type(policy.env).__name__, policy.env.config.site
+    ('ReachPose', 'grasp')
     """
     path = Path(path)
     if path.is_dir():

@@ -14,9 +14,10 @@ from arm5dof.grasp.evaluation import Eyes, Program, Setting
 from arm5dof.grasp.grasper import ATTEMPTS, Grasper
 from arm5dof.grasp.perception import Perception, SeenObject
 from arm5dof.grasp.robot import DryRun, SimulatedRobot
-from arm5dof.grasp.scene import TabletopScene
+from arm5dof.grasp.scene import TabletopScene, tabletop_scene
 from arm5dof.grasp.shipped import shipped
-from arm5dof.vision.objects import CLASS_NAMES
+from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
+from arm5dof.vision.synthetic.scenes import Placement
 
 EYES: tuple[Eyes, ...] = ("truth", "camera")
 
@@ -98,6 +99,17 @@ def test_what_is_not_there_is_said_not_to_be(eyes: Eyes):
     assert with_moon == f"no class 'moon': the detector knows {', '.join(CLASS_NAMES)}"
 
 
+def test_a_second_look_finds_what_the_first_does_not():
+    bench = Bench(1, "truth")
+    both = bench.perception
+    bench.perception = lambda image: [one for one in both(image) if one.name != "can"]
+    assert bench.grasper.pick("can").stage == "see"
+    five = bench.grasper.robot
+    again = Grasper(five, bench.perception, program("truth").planner, bench.rest, second_look=both)
+    outcome = again.pick("can")
+    assert outcome.success and outcome.attempts == 2 and bench.held() == {"can"}
+
+
 def test_what_is_out_of_reach_or_not_located_is_said_to_be():
     bench, far = Bench(0, "truth"), np.array([0.5, 0.0, 0.0125])
     for seen, stage, reason in (
@@ -143,7 +155,9 @@ def test_what_cannot_be_placed_is_still_held():
     assert bench.grasper.pick("red cube").success
     assert said(lambda: bench.grasper.place(bin="moon")).startswith("no bin 'moon': there are red cube, ")
     for both in ({}, {"point": np.zeros(2), "bin": "can"}):
-        assert said(lambda both=both: bench.grasper.place(**both)) == "place takes a point or the name of a bin"
+        assert said(lambda both=both: bench.grasper.place(**both)) == (
+            "place takes a point, the name of a bin, or the class of what it is put on"
+        )
     outcome = bench.grasper.place(np.array([0.6, 0.0]))
     assert outcome.stage == "place" and outcome.reason == "the place is out of reach"
     assert bench.held() == {"red cube"}
@@ -192,6 +206,27 @@ def test_an_object_lost_on_the_way_to_its_place_is_noticed():
     outcome = bench.grasper.place(bin=bench.names[0])
     assert outcome.stage == "lift" and outcome.reason == "the object was lost on the way" and bench.at_rest()
     assert "nothing is held" in said(lambda: bench.grasper.place(bin="can"))
+
+
+def test_what_is_wider_than_its_class_is_put_back():
+    """A ring that is taken for a can: the fingers come down on it, elsewhere close on it, feel how wide it is and let
+    go of it where it was."""
+    ring, up = CLASS_NAMES.index("ring"), np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0])
+    placement = Placement(ring, np.array([0.18, 0.05, CATALOGUE[ring].half_height]), 0.0)
+    scene = tabletop_scene(0, objects=[placement], distractors=False, bins=(), start=up)
+    told: list[str] = []
+    grasper = Grasper(
+        SimulatedRobot(scene),
+        lambda _: [SeenObject("can", 1.0, scene.object_poses()[0][0], 0.0)],
+        program("truth").planner,
+        up,
+        on_stage=told.append,
+    )
+    outcome = grasper.pick("can")
+    assert outcome.stage == "identify" and outcome.reason == "what is between the fingers is no can"
+    assert "give up: the arm met something on the way" in told
+    assert not scene.lifted(0.005).any() and np.linalg.norm(scene.object_poses()[0] - scene.start) < 0.02
+    np.testing.assert_allclose(grasper.robot.joints(), up, atol=0.01)
 
 
 def test_a_dry_run_is_told_what_an_arm_would_be():

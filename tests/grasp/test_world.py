@@ -83,7 +83,7 @@ def test_paths_are_checked_all_the_way():
     scene = scene_of_cans("arm5.xml")
     world, rng = world_of(scene, "arm5.xml"), np.random.default_rng(1)
     low = lambda q: not hit(scene, q, 0.02) and scene.data.site_xpos[scene.arm.site][2] < 0.05
-    poses = [q for q in rng.uniform(scene.arm.lower, scene.arm.upper, (2000, 5)) if low(q)][:20]
+    poses = [q for q in rng.uniform(scene.arm.lower, scene.arm.upper, (1500, 5)) if low(q)][:15]
     clear, blocked = 0, 0
     for ends in pairwise(poses):
         path = np.stack(ends)
