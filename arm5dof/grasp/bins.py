@@ -25,6 +25,8 @@ HALF, WALL, HEIGHT = 0.035, 0.002, 0.02
 turned, and a gripper that holds its center 20 mm above where it will lie opens above the walls."""
 COLOR = (0.1, 0.1, 0.11, 1.0)
 """Nearly black: the walls of a lighter bin are easily taken for bricks."""
+PILED = 0.06
+"""The center of an object that lies on others in a bin is no higher, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +45,11 @@ class Bin:
         return HALF - WALL
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3), metres, base frame, lie between its walls and hardly above them, (n,) bool."""
+        """Whether points (n, 3), metres, base frame, lie between its walls, on its floor or on what lies there,
+        (n,) bool."""
         along = np.array([np.cos(self.yaw), np.sin(self.yaw)])
         local = (points[:, :2] - self.position) @ np.stack([along, [-along[1], along[0]]], -1)
-        return (np.abs(local).max(-1) < HALF - WALL) & (points[:, 2] < HEIGHT + 0.005)
+        return (np.abs(local).max(-1) < HALF - WALL) & (points[:, 2] < PILED)
 
     def add_to(self, spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
         """Add the body `bin NAME` to a spec: four walls, which are returned, and a floor that is only seen."""

@@ -184,11 +184,13 @@ class Grasper:
         return self._put(where, height)
 
     def _free(self, bin: Bin) -> np.ndarray:
-        """Where in a bin to put what is held: the first on one side, the next on the other."""
+        """Where in a bin to put what is held: one corner after the other, opposite ones first."""
         assert self._held is not None
-        count = self._filled[bin.name] = self._filled.get(bin.name, 0) + 1
-        aside = max(0.0, bin.room - self._held.radius) * (1 if count % 2 else -1)
-        return bin.position + aside * np.array([-np.sin(bin.yaw), np.cos(bin.yaw)])
+        count = self._filled[bin.name] = self._filled.get(bin.name, -1) + 1
+        along = np.array([np.cos(bin.yaw), np.sin(bin.yaw)])
+        corner = np.array([(1, 1), (-1, -1), (1, -1), (-1, 1)][count % 4])
+        aside = max(0.0, bin.room - self._held.radius) * corner / (1 if self._held.radius < bin.room / 2 else 2**0.5)
+        return bin.position + aside @ np.stack([along, [-along[1], along[0]]])
 
     def put_back(self) -> Outcome:
         """Put down what is held where it was picked up, and go to rest."""
