@@ -35,9 +35,9 @@ camera's image alone.
   arm5dof grasp --image photo.jpg --camera posed.yml --pick can
                                                     joint angles for a real photograph, nothing moves
 
-With --json and --scenes: {"success_percent", "wrong_object_percent", "scenes", "reachable", "unreachable_told",
-"failures"}; percentages of success are of the requests that the arm can reach. Exit status 1 if a single request
-failed, 2 for bad input.
+With --json and --scenes: {"success_percent", "wrong_object_percent", "scenes", "in_sight", "reachable",
+"reachable_percent", "unreachable_told", "failures"}: success is of the requests that the arm can reach and of which the camera sees half or more. Exit status 1
+if a single request was not done, such as for a class that is not there, and 2 for bad input.
 """
 
 
@@ -103,11 +103,11 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
         return 0
     if args.json:
         print(json.dumps(Score((trial,)).as_json()))
-    elif not trial.reachable:
-        print(f"{trial.asked}: out of reach" + (", and told so" if trial.success else ""))
+    elif trial.success and trial.reachable:
+        print(f"{trial.asked}: done")
     else:
-        print(f"{trial.asked}: {'done' if trial.success else 'lost by ' + trial.lost}")
-    return 0 if trial.success else 1
+        print(f"{trial.asked}: not done, {trial.said or 'lost by ' + trial.lost}")
+    return 0 if trial.success and trial.reachable else 1
 
 
 def _watched(program: Program, video: Path | None, quiet: bool) -> Trial:

@@ -88,6 +88,8 @@ class Trial:
     """Whether an object of another class was lifted."""
     lost: str
     """Where it was lost, empty if it was not."""
+    said: str = ""
+    """What the program said of why it did not do it."""
 
 
 LOST_BY = {"see": "missed", "locate": "missed", "reach": "policy", "collide": "collision", "place": "place"}
@@ -236,7 +238,7 @@ class Program:
             placed = there.success and _at_rest(scene, which, s.place, bin)
         success = held and placed if reachable else not outcome.success and not wrong
         lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
-        return Trial(number, asked, reachable, in_sight, success, wrong, lost)
+        return Trial(number, asked, reachable, in_sight, success, wrong, lost, outcome.reason)
 
     def _job(
         self, number: int, scene: TabletopScene, watch: Callable[[TabletopScene, Perception], Observer] | None
@@ -254,7 +256,8 @@ class Program:
         success = all(_met(step, scene, there) for step in self.setting.job)
         stages = [one.outcome.stage for one in done if not one.outcome.success]
         lost = "" if success else LOST_BY.get(stages[0], "grip") if stages else "missed"
-        return Trial(number, "job", True, True, success, False, lost)
+        said = next((f"{one.name}: {one.outcome.reason}" for one in done if not one.outcome.success), "")
+        return Trial(number, "job", True, True, success, False, lost, said)
 
     def _reachable(self, scene: TabletopScene, i: int) -> bool:
         world = World(self.planner.arm)
