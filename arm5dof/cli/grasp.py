@@ -36,8 +36,9 @@ camera's image alone.
                                                     joint angles for a real photograph, nothing moves
 
 With --json and --scenes: {"success_percent", "wrong_object_percent", "scenes", "in_sight", "reachable",
-"reachable_percent", "unreachable_told", "failures"}: success is of the requests that the arm can reach and of which the camera sees half or more. Exit status 1
-if a single request was not done, such as for a class that is not there, and 2 for bad input.
+"reachable_percent", "unreachable_told", "failures"}; success is of the requests that the arm can reach and of which the
+camera sees half or more. Exit status 1 if a single request was not done, such as for a class that is not there, and 2
+for bad input.
 """
 
 
