@@ -110,6 +110,7 @@ class Grasper:
         self._held: CatalogueObject | None = None
         self._from: np.ndarray | None = None
         self._filled: dict[str, int] = {}
+        self._met: list[np.ndarray] = []
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self, again: bool = False) -> list[SeenObject]:
@@ -138,7 +139,7 @@ class Grasper:
         if name not in CLASS_NAMES:
             raise UserError(f"no class {name!r}: the detector knows {', '.join(CLASS_NAMES)}")
         outcome, again = Outcome("see"), False
-        self._met: list[np.ndarray] = []
+        self._met = []
         for attempt in range(1, ATTEMPTS + 1):
             outcome = self._attempt(name, attempt, again)
             unseen = outcome.stage in ("see", "locate")
@@ -263,7 +264,7 @@ class Grasper:
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
         self._objects = [one for one in self._objects if one is not target]
-        self._held, self._from = kind, target.position[:2]
+        self._held, self._from, self._met = kind, target.position[:2], []
         return Outcome("done", attempts=attempt, position=target.position)
 
     def _give_up(
