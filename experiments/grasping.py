@@ -4,6 +4,7 @@ python experiments/grasping.py                    every row on 1,000 scenes (100
 python experiments/grasping.py --scenes 50        quicker; nothing is written
 python experiments/grasping.py --rows "from pixels" "ground truth"
 python experiments/grasping.py --figure docs/grasp.png
+python experiments/grasping.py --speed            milliseconds from an image to a motion, on an idle machine
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +20,12 @@ import cv2
 import numpy as np
 
 from arm5dof.grasp.evaluation import Program, Setting, evaluate
-from arm5dof.grasp.grasper import Grasper
+from arm5dof.grasp.grasper import CLEARANCE, Grasper
 from arm5dof.grasp.jobs import Step
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import Disturbance
 from arm5dof.grasp.shipped import ARMS
+from arm5dof.grasp.world import World
 from arm5dof.runtime import files, xla
 from arm5dof.runtime.progress import Bar
 from arm5dof.vision.io.annotate import annotate
@@ -63,8 +66,12 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, help="of every row; nothing is written unless --rows names some")
     parser.add_argument("--rows", nargs="+", choices=ROWS, help="only these; others stay in the results as they are")
     parser.add_argument("--figure", type=Path, help="only draw one grasp, before and after")
+    parser.add_argument("--speed", action="store_true", help="only time one decision")
     arguments = parser.parse_args()
     xla.enable_compilation_cache()
+    if arguments.speed:
+        speed()
+        return
     if arguments.figure:
         figure(arguments.figure)
         return
@@ -79,6 +86,33 @@ def main() -> None:
         if arguments.scenes is None or arguments.rows:
             files.write_text(path, json.dumps(found, indent=1) + "\n")
             files.write_text(RESULTS / "grasping.md", markdown(found))
+
+
+def speed() -> None:
+    """From an image to a motion that is checked: medians over scenes, after a warm-up."""
+    program, seen, planned = Program(PAPER), [], []
+    for number in range(25):
+        scene = program.scene(number)
+        robot, (eyes, _) = SimulatedRobot(scene), program.perceptions(scene)
+        image = robot.image()
+        start = time.perf_counter()
+        objects = [one for one in eyes(image) if one.position is not None]
+        looked = time.perf_counter()
+        if not objects:
+            continue
+        world = World(program.planner.arm, scene.bins.values(), objects)
+        way = program.planner.approach(world, robot.joints(), objects[0].position, CLEARANCE, 0.04, 0)
+        if number >= 5 and not isinstance(way, str):
+            seen.append(1e3 * (looked - start))
+            planned.append(1e3 * (time.perf_counter() - looked))
+    text = (
+        "# One grasp, from an image to a motion that is checked\n\n"
+        f"Command: `python experiments/grasping.py --speed`. {platform.machine()} CPU, {len(seen)} scenes.\n\n"
+        f"Medians: detect and locate {np.median(seen):.1f} ms, plan {np.median(planned):.1f} ms, together "
+        f"{np.median(np.add(seen, planned)):.1f} ms (95th percentile {np.percentile(np.add(seen, planned), 95):.1f} ms).\n"
+    )
+    print(text)
+    files.write_text(RESULTS / "grasping_speed.md", text)
 
 
 def figure(path: Path) -> None:

@@ -100,6 +100,25 @@ class Planner:
             The way, or why there is none.
         """
         directions = _directions(point)
+        ways: list[tuple[np.ndarray, np.ndarray]] = []
+        # Straight down will do nearly always, and takes a twentieth of the time.
+        for some, depths in ((directions[:1], ALLOWED[:1]), (directions, ALLOWED)):
+            ways = self._ways(some, point, clearance, start)
+            if ways and not checked:
+                return Approach(ways[0][1][:1], ways[0][1], ways[0][0])
+            free = [way for way in ways if all(way[0] @ other <= np.cos(AVOIDED) for other in avoid)]
+            for allowed in depths:
+                for direction, line in free:
+                    if world.clear(line, opening, without, allowed):
+                        transit = self.transit(world, start, line[0], opening, allowed)
+                        if transit is not None:
+                            return Approach(transit, line, direction)
+        return "would collide" if ways else "out of reach"
+
+    def _ways(
+        self, directions: np.ndarray, point: np.ndarray, clearance: float, start: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Directions and lines of poses that lead to a point in them, the best first, whatever they hit."""
         along = np.linspace(clearance, 0, POINTS) / -directions[:, 2:]
         targets = point - directions[:, None] * along[..., None]
         answer = self.policy.solve(
@@ -107,27 +126,13 @@ class Planner:
         )
         shape = (len(directions), POINTS, -1)
         q = np.asarray(answer.q, float).reshape(*shape, self.arm.dof)
-        good = (np.asarray(answer.errors["distance"]) <= MAX_DISTANCE) & (
-            np.asarray(answer.errors["angle"]) <= MAX_ANGLE
-        )
-        ways = [
+        distance, angle = (np.asarray(answer.errors[name]) for name in ("distance", "angle"))
+        good = (distance <= MAX_DISTANCE) & (angle <= MAX_ANGLE)
+        return [
             (direction, line)
             for direction, candidates, valid in zip(directions, q, good.reshape(shape), strict=True)
             for line in _chains(candidates, valid, start)[:CHAINS]
         ]
-        if not ways:
-            return "out of reach"
-        if not checked:
-            return Approach(ways[0][1][:1], ways[0][1], ways[0][0])
-        # Only now: another number of goals would be another program to compile.
-        ways = [way for way in ways if all(way[0] @ other <= np.cos(AVOIDED) for other in avoid)]
-        for allowed in ALLOWED:
-            for direction, line in ways:
-                if world.clear(line, opening, without, allowed):
-                    transit = self.transit(world, start, line[0], opening, allowed)
-                    if transit is not None:
-                        return Approach(transit, line, direction)
-        return "would collide"
 
     def transit(
         self, world: World, start: np.ndarray, end: np.ndarray, opening: float, allowed: float = ALLOWED[-1]
