@@ -109,7 +109,7 @@ def speed() -> None:
         "# One grasp, from an image to a motion that is checked\n\n"
         f"Command: `python experiments/grasping.py --speed`. {platform.machine()} CPU, {len(seen)} scenes.\n\n"
         f"Medians: detect and locate {np.median(seen):.1f} ms, plan {np.median(planned):.1f} ms, together "
-        f"{np.median(np.add(seen, planned)):.1f} ms (95th percentile {np.percentile(np.add(seen, planned), 95):.1f} ms).\n"
+        f"{np.median(np.add(seen, planned)):.1f} (95th percentile {np.percentile(np.add(seen, planned), 95):.1f} ms).\n"
     )
     print(text)
     files.write_text(RESULTS / "grasping_speed.md", text)
