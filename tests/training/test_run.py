@@ -147,7 +147,14 @@ def test_half_a_run_goes_on_to_the_same_end_anywhere(runs: dict[str, Path], else
 
 MAY_CHANGE = {
     *("train.episodes", "train.evaluate_every", "train.checkpoint_every"),
-    *("evaluate.targets", "evaluate.interim_targets", "env.branches", "env.refinements"),
+    *(
+        "evaluate.targets",
+        "evaluate.interim_targets",
+        "env.branches",
+        "env.correction",
+        "env.restarts",
+        "env.refinements",
+    ),
 }
 
 
