@@ -29,8 +29,8 @@ a folder with its configuration, its robot, metrics, checkpoints, a figure and r
   arm5dof train --resume runs/reach                 go on with a run that was stopped
   arm5dof train my.toml --help                      the settings of that experiment's task
 
-A resumed run may have other episodes, evaluate_every, checkpoint_every, targets, interim_targets, branches and
-refinements in its config.toml; every other setting is as it was.
+A resumed run may have other episodes, evaluate_every, checkpoint_every, targets, interim_targets, and
+correction, branches, restarts and refinements in its config.toml; every other setting is as it was.
 """
 
 SMOKE = {
