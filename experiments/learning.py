@@ -21,6 +21,7 @@ import numpy as np
 
 from arm5dof import Run, load_config
 from arm5dof.runtime import files, xla
+from arm5dof.training.config import override
 from arm5dof.training.run import resume
 
 RESULTS = Path(__file__).parent / "results"
@@ -104,7 +105,7 @@ def train(name: str, line: str, seed: int) -> dict:
     experiment, *options = line.split()
     overrides = {option[2:]: value for option, value in zip(options[::2], options[1::2], strict=True)}
     settings = load_config(experiment, **{**overrides, "seed": seed})
-    settings = load_config(experiment, **{**overrides, "seed": seed, "evaluate-every": settings.train.episodes})
+    settings = override(settings, {"evaluate_every": settings.train.episodes})
     folder = Path("runs") / "learning" / re.sub(r"\W+", "-", f"{name}-{seed}")
     opened = Run.open(folder) if folder.exists() else Run.create(settings, folder)
     if opened.config != settings:

@@ -6,10 +6,10 @@ import multiprocessing
 import signal
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import mujoco
@@ -212,18 +212,12 @@ class Program:
         s, scene = self.setting, self.scene(number)
         if s.job:
             return self._job(number, scene, watch)
-        first, *second = self.perceptions(scene)
-        observer = watch(scene, first) if watch is not None else Observer()
+        robot, grasper = self._grasper(scene, watch)
         names = [one.catalogue_object.name for one in scene.objects]
         rng = np.random.default_rng((s.seed, number))
         asked = s.pick or (str(rng.choice(names)) if names else CLASS_NAMES[0])
         within = [i for i, name in enumerate(names) if name == asked and self._reachable(scene, i)]
         reachable, in_sight = bool(within), self.setting.eyes == "truth" or bool(_visible(scene) & set(within))
-        robot = SimulatedRobot(scene, on_step=observer.step)
-        first = observer.perception or first
-        look_again = second[0] if second else None
-        bins = scene.bins.values()
-        grasper = Grasper(robot, first, self.planner, robot.joints(), bins, look_again, observer.stage)
         outcome = grasper.pick(asked)
         if outcome.success:
             robot.move(np.array([HOLD]), robot.joints()[None])
@@ -240,18 +234,24 @@ class Program:
         lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
         return Trial(number, asked, reachable, in_sight, success, wrong, lost, outcome.reason)
 
+    def _grasper(
+        self, scene: TabletopScene, watch: Callable[[TabletopScene, Perception], Observer] | None
+    ) -> tuple[SimulatedRobot, Grasper]:
+        """The robot of a scene, and what moves it."""
+        first, *second = self.perceptions(scene)
+        observer = watch(scene, first) if watch is not None else Observer()
+        robot = SimulatedRobot(scene, on_step=observer.step)
+        eyes, look_again = observer.perception or first, second[0] if second else None
+        bins = scene.bins.values()
+        return robot, Grasper(robot, eyes, self.planner, robot.joints(), bins, look_again, observer.stage)
+
     def _job(
         self, number: int, scene: TabletopScene, watch: Callable[[TabletopScene, Perception], Observer] | None
     ) -> Trial:
         """Do the job, and see what it left behind."""
-        first, *second = self.perceptions(scene)
-        observer = watch(scene, first) if watch is not None else Observer()
+        _, grasper = self._grasper(scene, watch)
         seen = _visible(scene) if self.detectors else set(range(len(scene.objects)))
         there = [i for i in sorted(seen) if self._reachable(scene, i)]
-        robot = SimulatedRobot(scene, on_step=observer.step)
-        first, look_again = observer.perception or first, second[0] if second else None
-        bins = scene.bins.values()
-        grasper = Grasper(robot, first, self.planner, robot.joints(), bins, look_again, observer.stage)
         done = perform(grasper, self.setting.job)
         success = all(_met(step, scene, there) for step in self.setting.job)
         stages = [one.outcome.stage for one in done if not one.outcome.success]
@@ -354,11 +354,3 @@ def table(score: Score) -> str:
         lines.append(f"{found['unreachable_told']} of {told} requests out of reach were told so")
     lines += [f"  {count:4} lost by {name}" for name, count in found["failures"].items()]
     return "\n".join(lines)
-
-
-def rows(score: Score) -> list[dict[str, Any]]:
-    """A row for each scene."""
-    return [asdict(one) for one in score.trials]
-
-
-EYES: tuple[Eyes, ...] = get_args(Eyes)
