@@ -25,6 +25,12 @@ SQUARE_WEIGHT = 0.01
 """Weight of objects being as deep as they are wide, beside boxes weighted by their standard deviation. It moves what a
 box tells by less than a micrometre, and keeps objects from vanishing whose boxes are too flat to tell any depth."""
 
+ALIKE_WEIGHT = 10.0
+"""The same weight where an edge of the box is not known, and this tells the depth or the width in its place."""
+
+ELONGATION_STD = 0.4
+"""Standard deviation of the logarithm of an object's width by its depth: of a brick it is 0.7 across, -0.7 along."""
+
 TABLE_STD = 1e-3
 """Standard deviation of the table's height beside boxes weighted by theirs, metres. Nothing else tells the height, so
 any will do."""
@@ -58,6 +64,8 @@ def fit_box(
     start: Array,
     table_height: float | None,
     box_std: float,
+    known: Array | None = None,
+    elongation: Array | float = 0.0,
 ) -> BoxFit:
     """Fit a solid to the boxes of one object.
 
@@ -69,19 +77,32 @@ def fit_box(
         start: About where it is, (3,), metres, base frame.
         table_height: Of what it stands on in the base frame, metres; None if only the boxes are to tell.
         box_std: Standard deviation of an edge, pixels.
+        known: Which edges of the boxes are where the object ends, (v, 4) bool; None for all.
+        elongation: The logarithm of its width by its depth, (), which counts where not all edges are known.
 
     Returns:
-        The best solid. It can be differentiated by cameras, boxes and half height.
+        The best solid. It can be differentiated by cameras, boxes, half height and elongation.
     """
     parts = jnp.asarray(np.stack(list(FORMS.values())))[form]
 
-    def residual(unknown: jax.Array, cameras: Sequence[Camera], boxes: jax.Array, half_height: jax.Array) -> jax.Array:
+    def residual(
+        unknown: jax.Array,
+        cameras: Sequence[Camera],
+        boxes: jax.Array,
+        half_height: jax.Array,
+        elongation: Array | float,
+    ) -> jax.Array:
         center, logarithms = unknown[:3], unknown[3:].reshape(-1, 2)
         rows = [
             (solid_box(camera, center, jnp.exp(radii), half_height, parts) - seen) / box_std
             for camera, radii, seen in zip(cameras, logarithms, boxes, strict=True)
         ]
-        rows.append(SQUARE_WEIGHT * (logarithms[:, 0] - logarithms[:, 1]))
+        if known is None:
+            rows.append(SQUARE_WEIGHT * (logarithms[:, 0] - logarithms[:, 1]))
+        else:
+            rows = [jnp.where(these, row, 0.0) for row, these in zip(rows, known, strict=True)]
+            weights = jnp.where(known.all(1), SQUARE_WEIGHT, ALIKE_WEIGHT)
+            rows.append(weights * (logarithms[:, 0] - logarithms[:, 1] - elongation))
         if table_height is not None:
             rows.append((center[2:] - table_height - half_height) / TABLE_STD)
         return jnp.concatenate(rows)
@@ -97,7 +118,7 @@ def fit_box(
         change, _left = step(unknown, *jax.lax.stop_gradient(given))
         return unknown - jnp.clip(change, -1, 1)
 
-    given = (cameras, boxes, half_height)
+    given = (cameras, boxes, half_height, elongation)
     begin = jnp.concatenate([start, jnp.log(_half_widths(*jax.lax.stop_gradient(given[:2]), start)).repeat(2)])
     found = jax.lax.fori_loop(0, STEPS, bounded, begin)
     change, left = step(found, *given)

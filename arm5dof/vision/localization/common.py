@@ -107,6 +107,8 @@ class ObjectBatch(struct.PyTreeNode):
     """Standard deviations of the half heights, (n,), metres."""
     form: Array
     """Indices into `FORMS`, (n,), int."""
+    known: Array | None = None
+    """Which edges of the boxes are where the objects end, (n, 4) bool; None for all."""
 
     @classmethod
     def of(cls, boxes: np.ndarray, names: np.ndarray, solids: Solids) -> ObjectBatch:
@@ -150,11 +152,17 @@ def check_inputs(camera: Camera, box_std: float) -> None:
         )
 
 
-def detection_problems(detections: Detections, camera: Camera, solids: Solids) -> list[Problem]:
+def cut_edges(boxes: np.ndarray, camera: Camera) -> np.ndarray:
+    """Which edges of boxes (n, 4) are those of the camera's image, (n, 4) bool."""
+    high = boxes[:, 2:] > np.array([camera.width, camera.height]) - EDGE_MARGIN
+    return np.concatenate([boxes[:, :2] < EDGE_MARGIN, high], axis=1)
+
+
+def detection_problems(detections: Detections, camera: Camera, solids: Solids, cuts_allowed: int = 0) -> list[Problem]:
     """What can be wrong with detections, whatever the method."""
     unknown = np.array([name not in solids for name in detections.data["class_name"]], bool)
     low, high = detections.xyxy[:, :2], detections.xyxy[:, 2:]
-    cut = (low < EDGE_MARGIN).any(1) | (high > np.array([camera.width, camera.height]) - EDGE_MARGIN).any(1)
+    cut = cut_edges(detections.xyxy, camera).sum(1) > cuts_allowed
     return [
         (unknown, "no height is known of {name}"),
         ((high - low < 1).any(1), "its box is empty"),

@@ -10,7 +10,14 @@ import numpy as np
 
 from arm5dof.vision.camera import Array, Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.localization.box_fit import box_center, camera_errors, fit_box, independent, propagate
+from arm5dof.vision.localization.box_fit import (
+    ELONGATION_STD,
+    box_center,
+    camera_errors,
+    fit_box,
+    independent,
+    propagate,
+)
 from arm5dof.vision.localization.common import (
     MAX_RMS,
     NOTHING_SEEN,
@@ -20,6 +27,7 @@ from arm5dof.vision.localization.common import (
     Workspace,
     batched,
     check_inputs,
+    cut_edges,
     detection_problems,
 )
 
@@ -35,6 +43,7 @@ def by_plane(
     table_height: float = 0.0,
     box_std: float = 1.0,
     workspace: Workspace | None = None,
+    cut: bool = False,
 ) -> Localization:
     """Where objects of known height stand on a table, from one image.
 
@@ -45,6 +54,8 @@ def by_plane(
         table_height: Of the table in the base frame, metres.
         box_std: Standard deviation of each edge of a box, pixels.
         workspace: Says which positions count.
+        cut: Locate what one edge of the picture cuts off too: by the three others of its box, and by its being about
+            as deep as it is wide, which the covariance allows for.
 
     Returns:
         A position and its covariance for each detection, base frame, or why there is none.
@@ -54,9 +65,11 @@ def by_plane(
     """
     check_inputs(camera, box_std)
     objects = ObjectBatch.of(detections.xyxy, detections.data["class_name"], solids)
+    if cut:
+        objects = objects.replace(known=~cut_edges(detections.xyxy, camera))
     position, covariance, rms, sine = batched(_by_plane, objects, camera, table_height, box_std)
     problems = [
-        *detection_problems(detections, camera, solids),
+        *detection_problems(detections, camera, solids, int(cut)),
         (np.isnan(sine), NOTHING_SEEN),
         (sine < MIN_SINE, "the line of sight does not meet the table"),
         (~(rms < MAX_RMS * box_std), "nothing of the height of {name} on the table explains its box"),
@@ -71,9 +84,15 @@ def _by_plane(objects: ObjectBatch, camera: Camera, table_height: float, box_std
     def one(seen: ObjectBatch) -> tuple[jax.Array, ...]:
         start, sine = on_plane(camera, seen.boxes, table_height + seen.half_height)
 
-        def estimate(box: jax.Array, error: jax.Array, half_height: jax.Array) -> tuple[jax.Array, Any]:
-            cameras = [camera.perturbed(error)]
-            fit = fit_box(cameras, box[None], half_height[0], seen.form, start, table_height, box_std)
+        known = None if seen.known is None else seen.known[None]
+
+        def estimate(
+            box: jax.Array, error: jax.Array, half_height: jax.Array, *unlike: jax.Array
+        ) -> tuple[jax.Array, Any]:
+            cameras, elongation = [camera.perturbed(error)], unlike[0][0] if unlike else 0.0
+            fit = fit_box(
+                cameras, box[None], half_height[0], seen.form, start, table_height, box_std, known, elongation
+            )
             return fit.center, (fit.center, fit.reprojection_rms)
 
         inputs = [
@@ -81,6 +100,8 @@ def _by_plane(objects: ObjectBatch, camera: Camera, table_height: float, box_std
             camera_errors(camera),
             independent(seen.half_height[None], seen.std),
         ]
+        if known is not None:
+            inputs.append(independent(jnp.zeros(1), ELONGATION_STD))
         covariance, (center, rms) = propagate(estimate, inputs)
         return center, covariance, rms, sine
 

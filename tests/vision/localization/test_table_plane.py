@@ -125,6 +125,44 @@ def test_the_covariance_is_made_of_derivatives():
         np.testing.assert_allclose(found.covariance, by_camera @ by_camera.transpose(0, 2, 1), rtol=1e-2, atol=1e-9)
 
 
+def test_what_an_edge_of_the_picture_cuts_off_is_located_by_the_others():
+    """The picture ends within each object. Square objects lie where they lie; of others, which the box cannot tell
+    from square ones, the covariance says how far off they may be."""
+    rng = np.random.default_rng(5)
+    errors = {1.0: [], 2.0: []}
+    for _ in range(20):
+        camera = camera_at(over_the_table(rng, 40, 85))
+        names = list(rng.choice(NAMES, 8))
+        for ratio, found in errors.items():
+            centers, radii = on_the_table(rng, names), np.full((8, 2), 0.014) * [[ratio**0.5, ratio**-0.5]]
+            boxes = ideal_boxes(camera, centers, radii, names)
+            whole = (boxes[:, :2] > 1).all(1) & (boxes[:, 2:] < [camera.width - 1, camera.height - 1]).all(1)
+            middle, size = (boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]
+            for i in np.flatnonzero(whole):
+                # The camera's chip moved, so that it ends at a third of the object behind its middle.
+                axis = rng.integers(2)
+                edge = middle[i, axis] + size[i, axis] / 3
+                shift = np.eye(2)[axis] * ((camera.width, camera.height)[axis] - edge)
+                moved = camera.replace(matrix=camera.matrix + np.array([[0, 0, shift[0]], [0, 0, shift[1]], [0, 0, 0]]))
+                box = boxes[i] + np.tile(shift, 2)
+                box[2 + axis] = (camera.width, camera.height)[axis]
+                one, refused = (
+                    by_plane(detections(box[None], names[i : i + 1]), moved, SOLIDS, cut=cut) for cut in (True, False)
+                )
+                assert refused.failure == ("the picture's edge cuts it off",) and one.failure == ("",)
+                error = one.position[0] - centers[i]
+                found.append((np.linalg.norm(error), np.sqrt(error @ np.linalg.solve(one.covariance[0], error))))
+    exact, unlike = (np.array(found) for found in errors.values())
+    assert len(exact) > 100 and exact[:, 0].max() < 1e-4
+    assert len(unlike) > 100 and np.median(unlike[:, 0]) > 1e-3 and np.quantile(unlike[:, 1], 0.95) < 3
+    corner = detections(np.array([[0, 0, 40, 40.0]]), ["cube"])
+    assert by_plane(corner, camera, SOLIDS, cut=True).failure == ("the picture's edge cuts it off",)
+    inside = detections(np.array([[300, 200, 340, 240.0]]), ["cube"])
+    np.testing.assert_allclose(
+        by_plane(inside, camera, SOLIDS, cut=True).position, by_plane(inside, camera, SOLIDS).position, atol=1e-6
+    )
+
+
 def test_every_object_without_a_position_has_a_reason():
     """A camera that looks to the horizon, and boxes all over its image."""
     level = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
