@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from dataclasses import replace
 from functools import partial
@@ -373,6 +374,27 @@ def test_adam_steps_are_each_networks_own_rate(bench: Bench):
         large = np.abs(gradient) > 1e-4
         assert large.mean() > 0.5
         np.testing.assert_allclose(moved[large], -rate * np.sign(gradient[large]), rtol=2e-3)
+
+
+def test_muon_moves_matrices_by_orthogonal_steps(bench: Bench):
+    """Down the gradient, about as far in every direction; biases as Adam does."""
+    config = replace(bench.config, actor_optimizer="muon")
+    agent = DDPG(Probe(), config, num_envs=1, episode_length=10, total_steps=100)
+    training = agent.init(config, jax.random.key(0)).replace(networks=bench.training.networks)
+    after, _ = bench._replace(agent=agent, config=config, training=training).update(actor_lr=0.01)
+    plain, _ = bench.update(actor_lr=0.01)
+    moved, by_adam = (
+        jax.tree.map(lambda new, old: np.asarray(new - old), one.networks.actor, training.networks.actor)
+        for one in (after, plain)
+    )
+    for path, step in jax.tree_util.tree_leaves_with_path(moved):
+        other = functools.reduce(lambda tree, key: tree[key.key], path, by_adam)
+        if step.ndim == 2:
+            assert (step * other).sum() > 0
+            singular = np.linalg.svd(step, compute_uv=False) / (0.01 * max(1, step.shape[1] / step.shape[0]) ** 0.5)
+            assert singular.max() < 1.3 and np.median(singular) > 0.6
+        else:
+            np.testing.assert_array_equal(np.sign(step), np.sign(other))  # Adam's by Nesterov, so not as far.
 
 
 @pytest.mark.parametrize(("steps", "rate"), [(0, 1.0), (50, 0.6), (100, 0.2), (500, 0.2)])
