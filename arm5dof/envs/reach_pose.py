@@ -13,6 +13,7 @@ from arm5dof.arm import se3
 from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv, vectors
 from arm5dof.envs.base import Act
 from arm5dof.envs.metrics import Error, Metric, Share
+from arm5dof.envs.physics import Physics
 from arm5dof.errors import UserError
 from arm5dof.settings import settings, static
 
@@ -33,21 +34,25 @@ class ReachPoseConfig(ArmGoalConfig):
     six joints and more."""
     tool_axis: Literal["x", "y", "z", "-x", "-y", "-z"] = static(default="z")
     """The axis of the end-effector site that is the tool's (approach)."""
+    observation: Literal["cartesian", "cylindrical"] = static(default="cartesian")
+    """How the policy sees a goal. cartesian: as it is; cylindrical: its azimuth about the vertical axis through the
+    arm's origin, and the goal turned back by that: if the first joint turns about it, the other joints need no more."""
     metres_per_radian: Annotated[float, Gt(0)] = static(default=0.1)
     """What distance an angle is worth in the reward: 0.1 weighs a millimetre like 0.57 degrees."""
 
 
 class PoseGoal(NamedTuple):
-    """A point and one or two directions there, which the tool's axis, or the site's x and y axes, should have."""
+    """A point and one or three directions there, which the tool's axis, or the site's three axes, should have."""
 
     position: jax.Array
     """(3,) metres in the world frame."""
     directions: jax.Array
-    """(1, 3) or (2, 3), unit vectors in the world frame."""
+    """(1, 3) or (3, 3), unit vectors in the world frame."""
 
 
 class ReachPose(ArmGoalEnv):
-    """A goal is a `PoseGoal`. The reward is minus the length of (distance, metres_per_radian x angle), metres."""
+    """A goal is a `PoseGoal`. The reward is minus the length of `residual`, metres: about that of (distance,
+    metres_per_radian x angle), and linear in what networks see of two poses but for the length."""
 
     Config: ClassVar[type] = ReachPoseConfig
     config: ReachPoseConfig
@@ -78,12 +83,12 @@ class ReachPose(ArmGoalEnv):
         if not self._points and (np.abs(length - 1) > 1e-2).any():
             raise UserError(f"quaternion {turn[np.abs(length - 1).argmax()].tolist()} is no unit quaternion W X Y Z")
         unit = jnp.asarray(turn / length, jnp.float32)
-        directions = unit[:, None] if self._points else jnp.moveaxis(se3.from_quaternion(unit)[..., :2], -1, -2)
+        directions = unit[:, None] if self._points else jnp.moveaxis(se3.from_quaternion(unit), -1, -2)
         return PoseGoal(jnp.asarray(target, jnp.float32), directions)
 
     def forward(self, q: jax.Array) -> PoseGoal:
         """The end effector's position and directions."""
-        axes = [AXES[self.config.tool_axis]] if self._points else [AXES["x"], AXES["y"]]
+        axes = [AXES[self.config.tool_axis]] if self._points else [AXES[name] for name in "xyz"]
         return PoseGoal(self.arm.forward(q), jnp.stack([self.arm.axis(q, axis) for axis in axes]))
 
     def position(self, goal: PoseGoal) -> jax.Array:
@@ -93,6 +98,20 @@ class ReachPose(ArmGoalEnv):
         """The position relative to the arm's origin in units of its reach, and the directions."""
         return jnp.concatenate([self._scaled(goal.position), goal.directions.ravel()])
 
+    def actor_state(self, before: jax.Array, target: jax.Array) -> jax.Array:
+        if self.config.observation == "cartesian":
+            return target
+        rows = target.reshape(-1, 3)
+        radius = jnp.hypot(rows[0, 0], rows[0, 1])
+        # On the axis itself every azimuth is as good.
+        cosine, sine = jnp.where(radius > 1e-6, rows[0, :2] / jnp.maximum(radius, 1e-6), jnp.array([1.0, 0.0]))
+        back = jnp.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+        turned = (rows @ back).ravel()
+        return jnp.concatenate([jnp.stack([jnp.arctan2(sine, cosine) / jnp.pi, cosine, sine, radius]), turned[2:]])
+
+    def _actor_observation(self, data: Physics, q: jax.Array, there: jax.Array, target: jax.Array) -> jax.Array:
+        return self.actor_state(target, target)
+
     def decode(self, vector: jax.Array) -> PoseGoal:
         return PoseGoal(self._unscaled(vector[:3]), vector[3:].reshape(-1, 3))
 
@@ -101,21 +120,17 @@ class ReachPose(ArmGoalEnv):
         if self._points:
             angle = se3.angle_between(achieved.directions[0], goal.directions[0])
         else:
-            angle = se3.rotation_angle(_matrix(achieved), _matrix(goal))
+            angle = se3.rotation_angle(achieved.directions.T, goal.directions.T)
         return {"distance": jnp.linalg.norm(achieved.position - goal.position), "angle": angle}
 
     def goal_reward(self, achieved: PoseGoal, goal: PoseGoal, action: jax.Array) -> tuple[jax.Array, jax.Array]:
         """See the class. It never ends an episode."""
-        error = self.errors(achieved, goal)
-        return -jnp.hypot(error["distance"], self.config.metres_per_radian * error["angle"]), jnp.zeros(())
+        return -jnp.linalg.norm(self.residual(achieved, goal)), jnp.zeros(())
 
     def residual(self, achieved: PoseGoal, goal: PoseGoal) -> jax.Array:
         """The shift, and how far the tips of all directions lie apart, `metres_per_radian` long; of a rotation half of
         their squares, since each angle moves two of the three axes."""
-        if self._points:
-            turn = (achieved.directions - goal.directions).ravel()
-        else:
-            turn = (_matrix(achieved) - _matrix(goal)).ravel() / 2**0.5
+        turn = (achieved.directions - goal.directions).ravel() / (1 if self._points else 2**0.5)
         return jnp.concatenate([achieved.position - goal.position, self.config.metres_per_radian * turn])
 
     def correct(self, asked: PoseGoal, achieved: PoseGoal, goal: PoseGoal) -> PoseGoal:
@@ -123,7 +138,7 @@ class ReachPose(ArmGoalEnv):
         if self._points:
             directions = se3.carry_direction(asked.directions, achieved.directions, goal.directions)
         else:
-            directions = (_matrix(goal) @ _matrix(achieved).T @ _matrix(asked)).T[:2]
+            directions = (goal.directions.T @ achieved.directions @ asked.directions.T).T
         return PoseGoal(asked.position + goal.position - achieved.position, directions)
 
     def evaluate(self, act: Act, key: jax.Array, n: int) -> dict[str, jax.Array]:
@@ -138,9 +153,3 @@ class ReachPose(ArmGoalEnv):
     @property
     def _points(self) -> bool:
         return self.config.orientation == "approach"
-
-
-def _matrix(goal: PoseGoal) -> jax.Array:
-    """The rotation matrix (3, 3) of two directions."""
-    x, y = goal.directions
-    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
