@@ -13,9 +13,10 @@ from arm5dof.cli.parser import natural, nothing_left, positive
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
-    from arm5dof.grasp.evaluation import Program, Trial
+    from arm5dof.grasp.evaluation import Program
     from arm5dof.grasp.perception import Perception
     from arm5dof.grasp.scene import TabletopScene
+    from arm5dof.grasp.score import Trial
     from arm5dof.grasp.video import Recorder
 
 HELP = """\
@@ -28,7 +29,9 @@ camera's image alone.
   arm5dof grasp --scenes 1000 --seed 3 --json       how often it works, and where requests are lost
   arm5dof grasp --task sort.toml                    several picks and places: [[step]] with pick = a class or "any",
                                                     and bin = a name or "class", place = [x, y], or on = a class
-  arm5dof grasp --scenes 1000 --eyes truth          the same, had the camera seen everything right
+  arm5dof grasp --scenes 1000 --eyes truth          the same, had the camera seen everything right; "boxes": had the
+                                                    detector found everything
+  arm5dof grasp --scenes 1000 --pick absent         what it says where the class is not there
   arm5dof grasp --arm arm7_gripper.xml              another arm that ships
   arm5dof grasp --arm mine.xml --policy runs/mine   another arm: a policy trained by
                                                     arm5dof train reach_pose.toml --arm mine.xml --site grasp
@@ -59,7 +62,9 @@ def declare(commands: argparse._SubParsersAction) -> None:
     )
     p.add_argument("--scenes", type=positive, default=1, metavar="N", help="how many scenes; default 1")
     p.add_argument("--seed", type=natural, default=0, metavar="S", help="of the scenes; default 0")
-    p.add_argument("--eyes", choices=("camera", "truth"), default="camera", help="what is seen; default camera")
+    p.add_argument(
+        "--eyes", choices=("camera", "boxes", "truth"), default="camera", help="what is seen; default camera"
+    )
     p.add_argument("--video", type=Path, metavar="OUT.mp4", help="record the first scene")
     p.add_argument("--image", type=Path, metavar="PHOTO", help="plan for a photograph, with --camera and --pick")
     p.add_argument("--camera", type=Path, metavar="POSED.yml", help="the camera that took it, with its pose")
@@ -85,7 +90,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
     policy = args.policy or shipped(args.arm).policy
     if args.image is not None:
         return _photograph(args, policy)
-    from arm5dof.grasp.evaluation import Program, Score, Setting, evaluate, table
+    from arm5dof.grasp.evaluation import Program, Setting, evaluate
+    from arm5dof.grasp.score import Score, table
     from arm5dof.runtime.progress import Bar
 
     radii = tuple(args.radii) if args.radii else ARMS.get(args.arm, ARMS["arm5.xml"]).radii

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import mujoco
@@ -17,25 +16,31 @@ import numpy as np
 
 from arm5dof.arm import load_arm
 from arm5dof.errors import UserError
-from arm5dof.grasp.grasper import CLEARANCE, Grasper, Outcome, checked_place
+from arm5dof.grasp.grasper import CLEARANCE, Grasper, checked_place
 from arm5dof.grasp.gripper import SITE
+from arm5dof.grasp.ground_truth import TrueBoxes, TruePositions, in_sight
 from arm5dof.grasp.jobs import ANY, CLASS, Step, perform
-from arm5dof.grasp.perception import CameraPerception, Perception, SeenObject
+from arm5dof.grasp.outcome import Outcome
+from arm5dof.grasp.perception import CameraPerception, Perception
 from arm5dof.grasp.planner import Planner
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import UNDISTURBED, Disturbance, TabletopScene, tabletop_scene
+from arm5dof.grasp.score import LOST_BY, Score, Trial
 from arm5dof.grasp.world import World
 from arm5dof.runtime import xla
 from arm5dof.training.policy_file import load_policy
 from arm5dof.vision.detectors.loading import load_detector
 from arm5dof.vision.objects import CLASS_NAMES
-from arm5dof.vision.rendering.simulated import simulated_camera
-from arm5dof.vision.synthetic.ground_truth import truth
-from arm5dof.vision.synthetic.scene_builder import CAMERA
-from arm5dof.vision.synthetic.scenes import MAX_OBJECTS
+from arm5dof.vision.synthetic.scenes import MAX_AZIMUTH, MAX_OBJECTS
 
-Eyes = Literal["camera", "truth"]
-"""What the program sees: what its detector finds and localization places, or where objects truly are."""
+Eyes = Literal["camera", "boxes", "truth"]
+"""What the program sees: what its detector finds and localization places; the true boxes in the image, which
+localization places; or where objects truly are."""
+
+ABSENT = "absent"
+"""In place of a class: a random one that is not there."""
+FREE = "free"
+"""In place of where to put it: a random point on the table at which nothing lies."""
 
 HOLD = 2.0
 """Seconds for which an object must be held."""
@@ -43,6 +48,13 @@ LIFT = 0.05
 """Metres by which it must be lifted."""
 NEAR = 0.010
 """From where it should be put it may lie so far, metres."""
+FAINT = 0.1
+"""So little confidence is enough at the second look."""
+ROOM, HEIGHT = 0.06, 0.02
+"""To put something down is for a place from which all else is so far, and which the arm reaches at such a height,
+metres."""
+AT_REST = 0.05
+"""No joint is further from where the arm rests, radians."""
 MISPLACED = 0.010
 """An object that was thought so far from its place was lost by localization, metres."""
 
@@ -60,9 +72,9 @@ class Setting:
     seed: int
     eyes: Eyes = "camera"
     pick: str | None = None
-    """The class that is asked for; None for a random one that is there."""
-    place: tuple[float, float] | None = None
-    """Where it is put, metres, base frame; None to hold it."""
+    """The class that is asked for; None for a random one that is there, `ABSENT` for one that is not."""
+    place: tuple[float, float] | Literal["free"] | None = None
+    """Where it is put, metres, base frame, or `FREE`; None to hold it."""
     bin: str | None = None
     """Or the bin in which it is put; "class" for that of its class."""
     disturbance: Disturbance = UNDISTURBED
@@ -70,63 +82,6 @@ class Setting:
     """What is to be done instead of one pick."""
     count: tuple[int, int] = (3, MAX_OBJECTS)
     """The least and the greatest number of objects."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What came of one scene."""
-
-    number: int
-    asked: str
-    reachable: bool
-    """Whether an object of the class is there that the arm could reach, were nothing else there."""
-    in_sight: bool
-    """Whether one of those can be seen as the detector's own evaluation demands it, half of it or more."""
-    success: bool
-    """Lifted and held, and put where it should be; where none can be reached, whether that was said."""
-    wrong: bool
-    """Whether an object of another class was lifted."""
-    lost: str
-    """Where it was lost, empty if it was not."""
-    said: str = ""
-    """What the program said of why it did not do it."""
-
-
-LOST_BY = {"see": "missed", "locate": "missed", "reach": "policy", "collide": "collision", "place": "place"}
-"""By the stage at which a request ended, where that is all that is known."""
-LOST = ("missed", "wrong class", "localization", "policy", "collision", "grip", "place")
-"""Where requests are lost."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """What came of many scenes."""
-
-    trials: tuple[Trial, ...]
-
-    @property
-    def failures(self) -> dict[str, int]:
-        """How many requests that can be reached and are in sight were lost, by where."""
-        found = Counter(one.lost for one in self.trials if one.reachable and one.in_sight and not one.success)
-        return {name: found[name] for name in LOST if found[name]}
-
-    def as_json(self) -> dict[str, Any]:
-        """`success_percent` is of the requests that can be reached and are in sight, `reachable_percent` of all that
-        can be reached, `wrong_object_percent` of all scenes."""
-        reachable = [one for one in self.trials if one.reachable]
-        seen = [one for one in reachable if one.in_sight]
-        others = [one for one in self.trials if not one.reachable]
-        percent = lambda of, n: 100 * sum(of) / max(1, n)
-        return {
-            "success_percent": percent((one.success for one in seen), len(seen)),
-            "wrong_object_percent": percent((one.wrong for one in self.trials), len(self.trials)),
-            "scenes": len(self.trials),
-            "in_sight": len(seen),
-            "reachable": len(reachable),
-            "reachable_percent": percent((one.success for one in reachable), len(reachable)),
-            "unreachable_told": sum(one.success for one in others),
-            "failures": self.failures,
-        }
 
 
 def evaluate(setting: Setting, scenes: int, progress: Callable[[int], object] | None = None) -> Score:
@@ -172,15 +127,18 @@ class Program:
     """What tries a request: policy, planner and detector, loaded once."""
 
     def __init__(self, setting: Setting) -> None:
-        if setting.pick is not None and setting.pick not in CLASS_NAMES:
+        if setting.pick not in (None, ABSENT, *CLASS_NAMES):
             raise UserError(f"no class {setting.pick!r}: the detector knows {', '.join(CLASS_NAMES)}")
         if setting.bin not in (None, "class", *CLASS_NAMES):
             raise UserError(f"no bin {setting.bin!r}: there are {', '.join(CLASS_NAMES)}")
-        if setting.place is not None:
+        if isinstance(setting.place, tuple):
             checked_place(setting.place)
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
-        self.detectors = [load_detector(tta=tta) for tta in (False, True)] if setting.eyes == "camera" else []
+        self._empty = World(self.planner.arm)
+        self.detectors = (
+            [load_detector(), load_detector(confidence=FAINT, tta=True)] if setting.eyes == "camera" else []
+        )
 
     def scene(self, number: int) -> TabletopScene:
         """A random scene, the arm at rest out of the camera's way."""
@@ -198,9 +156,11 @@ class Program:
 
     def perceptions(self, scene: TabletopScene) -> list[Perception]:
         """What is seen of a scene, at the first look and at the second."""
-        if self.detectors:
-            return [CameraPerception(detector, scene.camera) for detector in self.detectors]
-        return [partial(_true, scene)]
+        if self.setting.eyes == "boxes":
+            return [CameraPerception(TrueBoxes(scene), scene.camera)]
+        if self.setting.eyes == "truth":
+            return [TruePositions(scene)]
+        return [CameraPerception(detector, scene.camera) for detector in self.detectors]
 
     def trial(self, number: int, watch: Callable[[TabletopScene, Perception], Observer] | None = None) -> Trial:
         """Ask for one object in one scene.
@@ -213,26 +173,51 @@ class Program:
         if s.job:
             return self._job(number, scene, watch)
         robot, grasper = self._grasper(scene, watch)
-        names = [one.catalogue_object.name for one in scene.objects]
         rng = np.random.default_rng((s.seed, number))
-        asked = s.pick or (str(rng.choice(names)) if names else CLASS_NAMES[0])
-        within = [i for i, name in enumerate(names) if name == asked and self._reachable(scene, i)]
-        reachable, in_sight = bool(within), self.setting.eyes == "truth" or bool(_visible(scene) & set(within))
+        names = [one.catalogue_object.name for one in scene.objects]
+        asked = self._asked(names, rng)
+        within = [i for i, name in enumerate(names) if name == asked and self._reaches(scene.start[i])]
+        reachable, in_sight = bool(within), bool(self._in_sight(scene) & set(within))
+        place = self._place(scene, rng)
         outcome = grasper.pick(asked)
         if outcome.success:
             robot.move(np.array([HOLD]), robot.joints()[None])
-        lifted = [name for name, up in zip(names, scene.lifted(LIFT), strict=True) if up]
-        wrong = any(name != asked for name in lifted)
-        held = outcome.success and asked in lifted
+        up = scene.lifted(LIFT)
+        lifted = {name for name, is_up in zip(names, up, strict=True) if is_up}
+        held, wrong = outcome.success and asked in lifted, bool(lifted - {asked})
         placed = True
-        if held and (s.place or s.bin):
-            which = int(np.flatnonzero([n == asked and up for n, up in zip(names, scene.lifted(LIFT), strict=True)])[0])
-            bin = asked if s.bin == "class" else s.bin
-            there = grasper.place(s.place and np.array(s.place), bin)
-            placed = there.success and _at_rest(scene, which, s.place, bin)
-        success = held and placed if reachable else not outcome.success and not wrong
+        if held and (place or s.bin):
+            bin = asked if s.bin == CLASS else s.bin
+            there = grasper.place(place, bin)
+            which = next(i for i, name in enumerate(names) if name == asked and up[i])
+            placed = there.success and _is_put(scene, which, place, bin)
+        told = not (outcome.success or up.any()) and bool(np.abs(robot.joints() - grasper.rest).max() < AT_REST)
+        success = held and placed if reachable else told
         lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
         return Trial(number, asked, reachable, in_sight, success, wrong, lost, outcome.reason)
+
+    def _asked(self, names: list[str], rng: np.random.Generator) -> str:
+        if self.setting.pick == ABSENT:
+            return str(rng.choice([name for name in CLASS_NAMES if name not in names]))
+        return self.setting.pick or (str(rng.choice(names)) if names else CLASS_NAMES[0])
+
+    def _place(self, scene: TabletopScene, rng: np.random.Generator) -> tuple[float, float] | None:
+        place = self.setting.place
+        return place if isinstance(place, tuple) else self._free(scene, rng) if place == FREE else None
+
+    def _free(self, scene: TabletopScene, rng: np.random.Generator) -> tuple[float, float]:
+        """A point that the arm can reach and beside which there is room for an object and for fingers."""
+        while True:
+            radius, azimuth = rng.uniform(*self.setting.radii), rng.uniform(-MAX_AZIMUTH, MAX_AZIMUTH)
+            point = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), HEIGHT])
+            free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+            away = scene.data.xpos[scene.model.jnt_bodyid[free]] - point
+            if (np.hypot(*away[:, :2].T) > ROOM).all() and self._reaches(point):
+                return float(point[0]), float(point[1])
+
+    def _in_sight(self, scene: TabletopScene) -> set[int]:
+        """The objects that the camera shows as the detector's own evaluation demands it."""
+        return set(range(len(scene.objects))) if self.setting.eyes == "truth" else in_sight(scene)
 
     def _grasper(
         self, scene: TabletopScene, watch: Callable[[TabletopScene, Perception], Observer] | None
@@ -250,8 +235,7 @@ class Program:
     ) -> Trial:
         """Do the job, and see what it left behind."""
         _, grasper = self._grasper(scene, watch)
-        seen = _visible(scene) if self.detectors else set(range(len(scene.objects)))
-        there = [i for i in sorted(seen) if self._reachable(scene, i)]
+        there = [i for i in sorted(self._in_sight(scene)) if self._reaches(scene.start[i])]
         done = perform(grasper, self.setting.job)
         success = all(_met(step, scene, there) for step in self.setting.job)
         stages = [one.outcome.stage for one in done if not one.outcome.success]
@@ -259,29 +243,14 @@ class Program:
         said = next((f"{one.name}: {one.outcome.reason}" for one in done if not one.outcome.success), "")
         return Trial(number, "job", True, True, success, False, lost, said)
 
-    def _reachable(self, scene: TabletopScene, i: int) -> bool:
-        world = World(self.planner.arm)
-        way = self.planner.approach(world, self.planner.arm.home, scene.start[i], CLEARANCE, 0.0, checked=False)
+    def _reaches(self, point: np.ndarray) -> bool:
+        """Whether the arm could bring its fingers to a point, were nothing else there."""
+        way = self.planner.approach(self._empty, self.planner.arm.home, point, CLEARANCE, 0.0, checked=False)
         return not isinstance(way, str)
 
 
-def _true(scene: TabletopScene, image: np.ndarray) -> list[SeenObject]:
-    """Where objects truly are, whatever an image shows."""
-    return [
-        SeenObject(one.catalogue_object.name, 1.0, position, 0.0)
-        for one, position in zip(scene.objects, scene.object_poses()[0], strict=True)
-    ]
-
-
-def _visible(scene: TabletopScene) -> set[int]:
-    """The objects of which the camera sees half or more."""
-    camera = simulated_camera(scene.model, CAMERA, scene.camera.width, scene.camera.height)
-    mujoco.mj_forward(scene.model, scene.data)
-    found = truth(scene, camera.segmentation(scene.data))
-    return {i for i, at in enumerate(scene.start) if (np.abs(found.position[found.counts] - at).max(1) < 1e-6).any()}
-
-
-def _at_rest(scene: TabletopScene, which: int, place: Sequence[float] | None, bin: str | None) -> bool:
+def _is_put(scene: TabletopScene, which: int, place: Sequence[float] | None, bin: str | None) -> bool:
+    """Whether an object lies where it should be put."""
     if bin is not None:
         return bool(scene.in_bin(bin)[which])
     away = scene.object_poses()[0][which, :2] - np.asarray(place)
@@ -339,18 +308,3 @@ def _start(setting: Setting) -> None:
 
 def _trial(number: int) -> Trial:
     return _program.trial(number)
-
-
-def table(score: Score) -> str:
-    """For people."""
-    found = score.as_json()
-    lines = [
-        f"{found['success_percent']:.2f} % of {found['in_sight']} requests that can be reached and are in sight, "
-        f"{found['reachable_percent']:.2f} % of all {found['reachable']} that can be reached",
-        f"another object lifted in {found['wrong_object_percent']:.2f} % of {found['scenes']} scenes",
-    ]
-    told = found["scenes"] - found["reachable"]
-    if told:
-        lines.append(f"{found['unreachable_told']} of {told} requests out of reach were told so")
-    lines += [f"  {count:4} lost by {name}" for name, count in found["failures"].items()]
-    return "\n".join(lines)

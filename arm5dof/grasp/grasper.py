@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -12,18 +10,12 @@ from arm5dof.errors import UserError
 from arm5dof.grasp.bins import HEIGHT as BIN_HEIGHT
 from arm5dof.grasp.bins import Bin
 from arm5dof.grasp.gripper import Gripper
+from arm5dof.grasp.outcome import Outcome, Stage
 from arm5dof.grasp.perception import Perception, SeenObject
 from arm5dof.grasp.planner import Approach, Planner
 from arm5dof.grasp.robot import Robot
 from arm5dof.grasp.world import World
 from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES, CatalogueObject
-
-Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "done"]
-"""Where an attempt ended. see: no object of the class was seen; locate: none could be located; reach: the policy has no
-answer; collide: every motion would hit something; grip: the fingers closed on nothing; lift: what they held was lost;
-identify: what they hold is wider than the class can be; place: no way to where it should go; done: as asked."""
-
-STAGES: tuple[Stage, ...] = get_args(Stage)
 
 CLEARANCE = 0.06
 """From how far above a point is approached, and how high objects are lifted, metres."""
@@ -37,6 +29,11 @@ DOUBT = 0.6
 """Of less confidence, what is seen is taken for an obstacle at the first attempt only."""
 ATTEMPTS = 3
 """From as many images."""
+PLACED = 0.006
+"""What is seen further from where it should lie is picked and put there again, metres: a gripper does not know where
+along its fingers it holds an object."""
+BESIDE = 0.06
+"""What was just put down is seen no further away, metres."""
 DROP = 0.003
 """Above where it will rest an object is let go, metres."""
 ARRIVED = 0.05
@@ -45,25 +42,8 @@ WIDER = 0.004
 """What is held may be so much wider than its class, metres."""
 LEAST = 0.002
 """An object between the fingers is at least so wide, metres."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a request."""
-
-    stage: Stage
-    """Where it ended."""
-    reason: str = ""
-    """In words, for people."""
-    attempts: int = 1
-    """How many images were taken."""
-    position: np.ndarray | None = field(default=None, repr=False)
-    """Where the object was thought to be, (3,), metres, base frame."""
-
-    @property
-    def success(self) -> bool:
-        """Whether it ended as asked."""
-        return self.stage == "done"
+SAME = 0.01
+"""Where the fingers closed on nothing, what is seen no further away is not there, metres."""
 
 
 class Grasper:
@@ -111,6 +91,7 @@ class Grasper:
         self._from: np.ndarray | None = None
         self._filled: dict[str, int] = {}
         self._met: list[np.ndarray] = []
+        self._nothing: list[np.ndarray] = []
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     def look(self, again: bool = False) -> list[SeenObject]:
@@ -139,14 +120,14 @@ class Grasper:
         if name not in CLASS_NAMES:
             raise UserError(f"no class {name!r}: the detector knows {', '.join(CLASS_NAMES)}")
         outcome, again = Outcome("see"), False
-        self._met = []
+        self._met, self._nothing = [], []
         for attempt in range(1, ATTEMPTS + 1):
             outcome = self._attempt(name, attempt, again)
             unseen = outcome.stage in ("see", "locate")
             # Another image of the same table shows the same.
             if outcome.success or outcome.stage == "reach" or (unseen and (again or self._second is None)):
                 break
-            again = unseen or outcome.stage == "collide"
+            again |= unseen or outcome.stage == "collide"
         return outcome
 
     def place(
@@ -178,20 +159,43 @@ class Grasper:
             assert below.position is not None
             where, height = below.position[:2], 2 * below.position[2] + self._held.half_height + DROP
         elif bin is not None:
-            where, height = self._free(self.bins[bin]), self._held.half_height + BIN_HEIGHT
+            where, height = self._free(self.bins[bin])
         else:
             assert point is not None
-            where, height = checked_place(point), self._held.half_height + DROP
+            return self._put_exactly(checked_place(point), self._held)
         return self._put(where, height)
 
-    def _free(self, bin: Bin) -> np.ndarray:
-        """Where in a bin to put what is held: one corner after the other, opposite ones first."""
+    def _put_exactly(self, where: np.ndarray, kind: CatalogueObject) -> Outcome:
+        """Put down what is held, see where it came to lie, and pick it up again while that is elsewhere."""
+        outcome = self._put(where, kind.half_height + DROP)
+        for _ in range(ATTEMPTS - 1):
+            if not outcome.success:
+                break
+            found = self._nearest(kind.name, where)
+            if found is None or found <= PLACED or not self._attempt(kind.name, 1, False, where).success:
+                break
+            outcome = self._put(where, kind.half_height + DROP)
+        return outcome
+
+    def _nearest(self, name: str, where: np.ndarray) -> float | None:
+        """How far from a place an object of a class is seen, metres, if it is no further than `BESIDE`, and not where
+        it was picked."""
+        seen = [one for one in self.look() if one.name == name and one.position is not None]
+        away = [_away(one, where) for one in seen if self._from is None or _away(one, self._from) > SAME]
+        return min((d for d in away if d <= BESIDE), default=None)
+
+    def _free(self, bin: Bin) -> tuple[np.ndarray, float]:
+        """Where in a bin, and how high, what is held is let go: in one corner after the other, opposite ones first; or,
+        where two would not fit in opposite corners, on top of each other."""
         assert self._held is not None
         count = self._filled[bin.name] = self._filled.get(bin.name, -1) + 1
+        if self._held.radius > 2**0.5 * (bin.room - self._held.radius):
+            pile = 2 * self._held.half_height * count + DROP
+            return bin.position, self._held.half_height + max(BIN_HEIGHT, pile)
         along = np.array([np.cos(bin.yaw), np.sin(bin.yaw)])
         corner = np.array([(1, 1), (-1, -1), (1, -1), (-1, 1)][count % 4])
-        aside = max(0.0, bin.room - self._held.radius) * corner / (1 if self._held.radius < bin.room / 2 else 2**0.5)
-        return bin.position + aside @ np.stack([along, [-along[1], along[0]]])
+        aside = (bin.room - self._held.radius) * corner
+        return bin.position + aside @ np.stack([along, [-along[1], along[0]]]), self._held.half_height + BIN_HEIGHT
 
     def put_back(self) -> Outcome:
         """Put down what is held where it was picked up, and go to rest."""
@@ -214,10 +218,13 @@ class Grasper:
         self._go_to_rest()
         return Outcome("done")
 
-    def _attempt(self, name: str, attempt: int, again: bool) -> Outcome:
+    def _attempt(self, name: str, attempt: int, again: bool, near: np.ndarray | None = None) -> Outcome:
+        """Try once to pick an object of a class, the one that is nearest to a place or else the surest."""
         seen = self.look(again)
-        wanted = [one for one in seen if one.name == name]
+        wanted = [one for one in seen if one.name == name and not self._is_nothing(one)]
         located = [one for one in wanted if one.position is not None]
+        if near is not None:
+            located = sorted(located, key=lambda one: _away(one, near))[:1]
         # Where everything would collide, the doubtful may not be there.
         doubt = 0.0 if attempt == 1 else DOUBT
         self._objects = [
@@ -240,6 +247,12 @@ class Grasper:
             outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, target.position)
         return outcome
 
+    def _is_nothing(self, seen: SeenObject) -> bool:
+        """Whether the fingers closed there on nothing, and it is doubtful too."""
+        if seen.position is None or seen.confidence >= DOUBT:
+            return False
+        return any(np.linalg.norm(seen.position - other) < SAME for other in self._nothing)
+
     def _approach(self, point: np.ndarray, opening: float, target: SeenObject | None = None) -> Approach | str:
         world = World(self.planner.arm, self.bins.values(), self._objects)
         without = None if target is None else self._objects.index(target)
@@ -255,6 +268,7 @@ class Grasper:
             return self._give_up("collide", "the arm met something on the way", way, attempt, target)
         self.robot.grip(-SQUEEZE)
         if self.robot.opening() < LEAST:
+            self._nothing.append(target.position)
             return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
         if self.robot.opening() > 2 * kind.radius + WIDER:
             self._met.append(way.direction)
@@ -295,6 +309,12 @@ class Grasper:
         before = np.concatenate([[self.robot.joints()], path[:-1]])
         seconds = np.maximum(np.abs(path - before).max(1) / speed, 0.02)
         self.robot.move(np.cumsum(seconds), path)
+
+
+def _away(seen: SeenObject, where: np.ndarray) -> float:
+    """How far from a place on the table something is seen, metres."""
+    assert seen.position is not None
+    return float(np.hypot(*(seen.position[:2] - where)))
 
 
 def checked_place(point: np.ndarray | Sequence[float]) -> np.ndarray:

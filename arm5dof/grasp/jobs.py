@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from arm5dof.errors import UserError, nearest_hint
-from arm5dof.grasp.grasper import Grasper, Outcome, checked_place
+from arm5dof.grasp.grasper import Grasper, checked_place
+from arm5dof.grasp.outcome import Outcome
 from arm5dof.vision.objects import CLASS_NAMES
 
 ANY, CLASS = "any", "class"
@@ -95,20 +96,26 @@ def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
         if step.pick != ANY:
             done.append(Done(step.pick, _move(grasper, step.pick, step)))
             continue
-        hopeless: set[str] = set()
+        moved, failed = 0, dict[str, int]()
         for _ in range(MOST):
-            names = [name for name in _seen(grasper) if name not in hopeless]
+            # What failed is tried again when something else is out of its way, after what did not fail.
+            names = [n for n in _seen(grasper) if failed.get(n) != moved] or [
+                n for n in _seen(grasper, again=True) if failed.get(n) != moved
+            ]
             if not names:
                 break
-            done.append(Done(names[0], _move(grasper, names[0], step)))
-            if not done[-1].outcome.success:
-                hopeless.add(names[0])
+            name = min(names, key=lambda n: n in failed)
+            done.append(Done(name, _move(grasper, name, step)))
+            if done[-1].outcome.success:
+                moved += 1
+            else:
+                failed[name] = moved
     return done
 
 
-def _seen(grasper: Grasper) -> list[str]:
+def _seen(grasper: Grasper, again: bool = False) -> list[str]:
     """Classes of what can be located, the surest first, each once."""
-    return list(dict.fromkeys(one.name for one in grasper.look() if one.position is not None))
+    return list(dict.fromkeys(one.name for one in grasper.look(again) if one.position is not None))
 
 
 def _move(grasper: Grasper, name: str, step: Step) -> Outcome:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision.boxes import iou
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detector
-from arm5dof.vision.localization import locate
-from arm5dof.vision.localization.solids import Solid
-from arm5dof.vision.objects import CATALOGUE
+from arm5dof.vision.localization.solids import CATALOGUE_SOLIDS
+from arm5dof.vision.localization.table_plane import by_plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +31,19 @@ class SeenObject:
     """Why it has no position."""
 
 
+SURE = 0.25
+"""Of less confidence, something counts only where nothing more certain is."""
+SAME = 0.3
+"""Boxes whose intersection over union is larger may be of one object."""
+
 Perception = Callable[[np.ndarray], list[SeenObject]]
 """From an RGB image (h, w, 3) uint8 to what is seen in it, the surest first."""
 
 
 class CameraPerception:
     """A detector, and a calibrated camera whose place is known; objects stand on the table.
+
+    Of what lies half in the picture, its edge is no edge of the object: see `by_plane`.
 
     Args:
         detector: What finds objects.
@@ -51,7 +58,6 @@ class CameraPerception:
         if not camera.has_extrinsics:
             raise UserError("the camera has no extrinsics: find its pose first (arm5dof.vision.calibration)")
         self.detector, self.camera, self.box_std = detector, camera, box_std
-        self._solids = {one.name: Solid(one.half_height, form=one.form) for one in CATALOGUE}
 
     def __call__(self, image: np.ndarray) -> list[SeenObject]:
         """See `Perception`. Raises `UserError` for an image of another size than the camera's."""
@@ -59,8 +65,10 @@ class CameraPerception:
             size, wanted = f"{image.shape[1]} x {image.shape[0]}", f"{self.camera.width} x {self.camera.height}"
             raise UserError(f"the image is {size}, the camera was calibrated for {wanted}: give one of its own")
         detections = self.detector(image)
-        found = locate(detections, self.camera, self._solids, box_std=self.box_std)
+        found = by_plane(detections, self.camera, CATALOGUE_SOLIDS, box_std=self.box_std, cut=True)
         names = detections.data["class_name"]
+        sure = detections.confidence >= SURE
+        same = (iou(detections.xyxy[:, None], detections.xyxy[sure]) > SAME).any(1)
         return [
             SeenObject(
                 str(names[i]),
@@ -70,4 +78,5 @@ class CameraPerception:
                 failure,
             )
             for i, failure in enumerate(found.failure)
+            if sure[i] or not same[i]
         ]

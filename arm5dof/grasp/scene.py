@@ -215,7 +215,7 @@ def _make_movable(body: mujoco.MjsBody, density: float, friction: np.ndarray) ->
     _make_solid(body.geoms, OBJECT_BIT, ARM_BIT | OBJECT_BIT, friction)
     for geom in body.geoms:
         geom.density = density
-        rolls = geom.type not in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER)
+        rolls = geom.type != mujoco.mjtGeom.mjGEOM_BOX
         geom.condim = 6 if rolls else 4
 
 

@@ -64,11 +64,14 @@ class Bench:
 
     def remove(self, name: str) -> None:
         """Take all objects of a class off the table."""
-        model, data = self.scene.model, self.scene.data
         for i, other in enumerate(self.names):
             if other == name:
-                first = model.jnt_qposadr[model.body(f"object {i}").jntadr[0]]
-                data.qpos[first : first + 2] = [5 + i, 5]
+                self.position(i)[:] = [5 + i, 5]
+
+    def position(self, i: int) -> np.ndarray:
+        """x and y of an object in the simulation, to be changed."""
+        first = self.scene.model.jnt_qposadr[self.scene.model.body(f"object {i}").jntadr[0]]
+        return self.scene.data.qpos[first : first + 2]
 
     def at_rest(self) -> bool:
         return np.abs(self.robot.joints() - self.rest).max() < 0.01 and not self.scene.lifted().any()
@@ -146,6 +149,40 @@ def test_it_is_put_down_where_it_should_be(eyes: Eyes):
         assert np.linalg.norm(position - point) <= 0.010
         assert bench.at_rest() and bench.scene.resting().all()
         point = point * 0.72
+
+
+def test_what_came_to_lie_elsewhere_is_put_there_again():
+    """As what was held at its end, or rolls away, does."""
+    bench, point = Bench(1, "truth"), np.array([0.19, 0.02])
+    which, moved = bench.names.index("can"), []
+
+    def roll_away(words: str) -> None:
+        if words == "look" and "rest" in bench.said and not moved:
+            moved.append(which)
+            bench.position(which)[:] += [0.012, -0.008]
+
+    assert bench.grasper.pick("can").success
+    bench.on_stage = roll_away
+    assert bench.grasper.place(point).success
+    assert moved and sum(words.startswith("place at") for words in bench.said) == 2
+    assert np.linalg.norm(bench.scene.object_poses()[0][which, :2] - point) < 0.006 and bench.at_rest()
+
+
+def test_what_is_faint_and_not_there_is_tried_once():
+    bench = Bench(0, "truth")
+    name = bench.absent()
+    free = next(
+        np.array([x, y, 0.01])
+        for x in (0.2, 0.15, 0.22)
+        for y in (0.0, 0.1, -0.1)
+        if np.linalg.norm(bench.scene.start[:, :2] - [x, y], axis=1).min() > 0.06
+    )
+    nothing = SeenObject(name, 0.15, free, 0.001)
+    true = bench.perception
+    bench.perception = lambda image: [*true(image), nothing]
+    outcome = bench.grasper.pick(name)
+    assert outcome.stage == "see" and bench.said.count("give up: the fingers closed on nothing") == 1
+    assert bench.at_rest() and not bench.held()
 
 
 def test_what_cannot_be_placed_is_still_held():

@@ -9,8 +9,9 @@ from helpers.errors import said
 from arm5dof.grasp.perception import CameraPerception
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import TabletopScene, tabletop_scene
-from arm5dof.vision.detections import Detector
+from arm5dof.vision.detections import Detections, Detector
 from arm5dof.vision.detectors.loading import load_detector
+from arm5dof.vision.objects import CLASS_NAMES
 
 UP = np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0])
 
@@ -51,6 +52,15 @@ def test_what_cannot_be_located_is_seen_with_a_reason(detector: Detector, scene:
     assert seen
     for one in seen:
         assert one.position is None and one.failure and np.isnan(one.std)
+
+
+def test_what_is_faint_counts_where_nothing_certain_is(scene: TabletopScene):
+    def detector(image: np.ndarray) -> Detections:
+        boxes = [[300, 200, 340, 240], [302, 201, 341, 242], [100, 300, 140, 340]]
+        return Detections(boxes, [0.9, 0.2, 0.2], [0, 1, 1], CLASS_NAMES)
+
+    seen = CameraPerception(detector, scene.camera)(np.zeros((480, 640, 3), np.uint8))
+    assert [(one.name, round(one.confidence, 2)) for one in seen] == [("red cube", 0.9), ("blue cube", 0.2)]
 
 
 def test_cameras_and_images_that_do_not_fit_are_refused(detector: Detector, scene: TabletopScene):
