@@ -94,6 +94,11 @@ class Grasper:
         self._nothing: list[np.ndarray] = []
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
+    @property
+    def holds(self) -> str | None:
+        """The class of what it holds, as far as it knows."""
+        return None if self._held is None else self._held.name
+
     def look(self, again: bool = False) -> list[SeenObject]:
         """What is seen now, but for what lies in a bin. `again` takes the second look."""
         self._say("look again" if again else "look")
@@ -115,10 +120,12 @@ class Grasper:
             What came of it. Unless it is `done` the arm is at rest and the gripper empty.
 
         Raises:
-            UserError: There is no such class.
+            UserError: There is no such class, or something is held already.
         """
         if name not in CLASS_NAMES:
             raise UserError(f"no class {name!r}: the detector knows {', '.join(CLASS_NAMES)}")
+        if self._held is not None:
+            raise UserError(f"the gripper holds the {self._held.name}: place it first, or put it back")
         outcome, again = Outcome("see"), False
         self._met, self._nothing = [], []
         for attempt in range(1, ATTEMPTS + 1):

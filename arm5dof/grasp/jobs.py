@@ -86,7 +86,8 @@ def read_job(path: str | Path) -> list[Step]:
 
 
 def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
-    """Do the steps in order, whatever becomes of one of them.
+    """Do the steps in order, whatever becomes of one of them, unless what is held can be put nowhere: then it stays
+    held, and that is the end.
 
     Returns:
         What came of each object that was tried, in order.
@@ -95,6 +96,8 @@ def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
     for step in steps:
         if step.pick != ANY:
             done.append(Done(step.pick, _move(grasper, step.pick, step)))
+            if grasper.holds:
+                return done
             continue
         moved, failed = 0, dict[str, int]()
         for _ in range(MOST):
@@ -106,6 +109,8 @@ def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
                 break
             name = min(names, key=lambda n: n in failed)
             done.append(Done(name, _move(grasper, name, step)))
+            if grasper.holds:
+                return done
             if done[-1].outcome.success:
                 moved += 1
             else:
@@ -123,7 +128,7 @@ def _move(grasper: Grasper, name: str, step: Step) -> Outcome:
     if not picked.success:
         return picked
     placed = grasper.place(step.place, name if step.bin == CLASS else step.bin, step.on)
-    if not placed.success:
+    if not placed.success and grasper.holds:
         grasper.put_back()
     return placed
 

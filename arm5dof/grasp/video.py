@@ -8,13 +8,12 @@ import cv2
 import mujoco
 import numpy as np
 
-from arm5dof.errors import UserError
 from arm5dof.grasp.evaluation import Observer
 from arm5dof.grasp.perception import CameraPerception, Perception, SeenObject
 from arm5dof.grasp.scene import TabletopScene
 from arm5dof.vision.detections import Detections
 from arm5dof.vision.io.annotate import annotate
-from arm5dof.vision.opencv import quiet
+from arm5dof.vision.io.mp4 import Mp4
 from arm5dof.vision.rendering.simulated import simulated_camera
 from arm5dof.vision.synthetic.scene_builder import CAMERA, SECOND
 
@@ -37,15 +36,11 @@ class Recorder(Observer):
     """
 
     def __init__(self, path: Path, scene: TabletopScene, perception: Perception) -> None:
-        self._scene, self._inner, self._path = scene, perception, path
+        self._scene, self._inner = scene, perception
         self._views = [simulated_camera(scene.model, name, *SIZE) for name in (CAMERA, SECOND)]
         self._found: Detections | None = None
-        self._words, self._count = "", 0
-        with quiet():
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, RATE, (2 * SIZE[0], SIZE[1]))
-        if not self._writer.isOpened():
-            raise UserError(f"{path}: OpenCV cannot write an MP4 there")
+        self._words = ""
+        self._video = Mp4(path, (2 * SIZE[0], SIZE[1]), RATE)
         self.perception = self._look
 
     def stage(self, words: str) -> None:
@@ -60,12 +55,9 @@ class Recorder(Observer):
         self._write(1)
 
     def close(self) -> None:
-        """Finish the file. Raises `UserError` unless every frame is in it: the encoder tells nobody of a full disk."""
-        self._writer.release()
-        with quiet():
-            capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-        if capture.get(cv2.CAP_PROP_FRAME_COUNT) != self._count:
-            raise UserError(f"{self._path} could not be written whole: is the disk full?")
+        """Finish the file. Raises `UserError` if it is not whole."""
+        self._video.close()
+        self._video.check()
 
     def _look(self, image: np.ndarray) -> list[SeenObject]:
         if isinstance(self._inner, CameraPerception):
@@ -86,7 +78,4 @@ class Recorder(Observer):
         cv2.putText(
             frame, self._words, (8, SIZE[1] - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
         )
-        with quiet():
-            for _ in range(times):
-                self._writer.write(frame[..., ::-1])
-        self._count += times
+        self._video.write(frame, times)

@@ -15,14 +15,13 @@ from typing import Any, TextIO
 import cv2
 import numpy as np
 
-from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.vision.detections import Detections
 from arm5dof.vision.frames import Frame
 from arm5dof.vision.io.annotate import annotate
 from arm5dof.vision.io.detections_file import as_json
+from arm5dof.vision.io.mp4 import Mp4
 from arm5dof.vision.io.sources import DEFAULT_RATE, IMAGE_SUFFIXES, Source
-from arm5dof.vision.opencv import quiet
 
 Write = Callable[[Frame, Any], None]
 """Takes a frame and what was found in it: detections, or their localization."""
@@ -130,42 +129,24 @@ def _video(into: Path, source: Source) -> Iterator[Show]:
 
 
 class _Video:
-    """MPEG-4 part 2: players show it, browsers do not. All else that pip's OpenCV can put into an MP4 is VP9, which
-    takes several times longer."""
+    """A video whose name and size the first frame says."""
 
     def __init__(self, into: Path, rate: float, live: bool) -> None:
         self._into, self._rate, self._live = into, rate, live
-        self._encoder = cv2.VideoWriter()
-        self._written = 0
+        self._file: Mp4 | None = None
 
     def show(self, frame: Frame, image: np.ndarray) -> None:
-        if not self._written:
-            self._open(Path(frame.name).stem, image)
-        if image.shape[1::-1] != self._size:  # The encoder would leave it out without a word.
-            image = cv2.resize(image, self._size)
+        if self._file is None:
+            size = (image.shape[1], image.shape[0])
+            self._file = Mp4(self._into / f"{Path(frame.name).stem}.mp4", size, self._rate)
         # A camera's frames come as fast as they are looked at; the video runs as fast as the clock did.
         due = round((frame.time or 0) * self._rate) + 1 if self._live else 0
-        for _ in range(max(1, due - self._written)):
-            with quiet():
-                self._encoder.write(image[..., ::-1])
-            self._written += 1
+        self._file.write(image, max(1, due - self._file.frames))
 
     def close(self) -> None:
-        self._encoder.release()
+        if self._file is not None:
+            self._file.close()
 
     def check(self) -> None:
-        """Raise `UserError` unless every frame is in the file: the encoder tells nobody of a full disk."""
-        if self._written:
-            with quiet():
-                capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-            if capture.get(cv2.CAP_PROP_FRAME_COUNT) != self._written:
-                raise UserError("the annotated video could not be written whole: is the disk full?")
-
-    def _open(self, name: str, image: np.ndarray) -> None:
-        self._path, self._size = self._into / f"{name}.mp4", image.shape[1::-1]
-        with quiet():
-            code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._encoder.open(str(self._path), cv2.CAP_FFMPEG, code, self._rate, self._size)
-        if not self._encoder.isOpened():
-            width, height = self._size
-            raise UserError(f"OpenCV cannot write a video of {width} x {height} at {self._rate:g} frames per second")
+        if self._file is not None:
+            self._file.check()
