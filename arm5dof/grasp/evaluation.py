@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,13 +19,12 @@ from arm5dof.errors import UserError
 from arm5dof.grasp.grasper import CLEARANCE, Grasper, checked_place
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.ground_truth import TrueBoxes, TruePositions, in_sight
-from arm5dof.grasp.jobs import ANY, CLASS, Step, perform
-from arm5dof.grasp.outcome import Outcome
+from arm5dof.grasp.jobs import CLASS, Step, perform
 from arm5dof.grasp.perception import CameraPerception, Perception
 from arm5dof.grasp.planner import Planner
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import UNDISTURBED, Disturbance, TabletopScene, tabletop_scene
-from arm5dof.grasp.score import LOST_BY, Score, Trial
+from arm5dof.grasp.score import LOST_BY, Score, Trial, is_met, is_put, lost_by
 from arm5dof.grasp.world import World
 from arm5dof.runtime import xla
 from arm5dof.training.policy_file import load_policy
@@ -46,17 +45,15 @@ HOLD = 2.0
 """Seconds for which an object must be held."""
 LIFT = 0.05
 """Metres by which it must be lifted."""
-NEAR = 0.010
-"""From where it should be put it may lie so far, metres."""
 FAINT = 0.1
 """So little confidence is enough at the second look."""
 ROOM, HEIGHT = 0.06, 0.02
 """To put something down is for a place from which all else is so far, and which the arm reaches at such a height,
 metres."""
+PLACES = 1000
+"""So many random ones are looked at."""
 AT_REST = 0.05
 """No joint is further from where the arm rests, radians."""
-MISPLACED = 0.010
-"""An object that was thought so far from its place was lost by localization, metres."""
 
 
 @dataclass(frozen=True)
@@ -190,10 +187,10 @@ class Program:
             bin = asked if s.bin == CLASS else s.bin
             there = grasper.place(place, bin)
             which = next(i for i, name in enumerate(names) if name == asked and up[i])
-            placed = there.success and _is_put(scene, which, place, bin)
+            placed = there.success and is_put(scene, which, place, bin)
         told = not (outcome.success or up.any()) and bool(np.abs(robot.joints() - grasper.rest).max() < AT_REST)
         success = held and placed if reachable else told
-        lost = "" if success else _lost(outcome, held, wrong, scene, names, asked)
+        lost = "" if success else lost_by(outcome, held, wrong, scene, names, asked)
         return Trial(number, asked, reachable, in_sight, success, wrong, lost, outcome.reason)
 
     def _asked(self, names: list[str], rng: np.random.Generator) -> str:
@@ -207,13 +204,14 @@ class Program:
 
     def _free(self, scene: TabletopScene, rng: np.random.Generator) -> tuple[float, float]:
         """A point that the arm can reach and beside which there is room for an object and for fingers."""
-        while True:
+        for _ in range(PLACES):
             radius, azimuth = rng.uniform(*self.setting.radii), rng.uniform(-MAX_AZIMUTH, MAX_AZIMUTH)
             point = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), HEIGHT])
             free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
             away = scene.data.xpos[scene.model.jnt_bodyid[free]] - point
             if (np.hypot(*away[:, :2].T) > ROOM).all() and self._reaches(point):
                 return float(point[0]), float(point[1])
+        raise UserError(f"none of {PLACES} random places on the table is free and within reach: give a place")
 
     def _in_sight(self, scene: TabletopScene) -> set[int]:
         """The objects that the camera shows as the detector's own evaluation demands it."""
@@ -237,7 +235,7 @@ class Program:
         _, grasper = self._grasper(scene, watch)
         there = [i for i in sorted(self._in_sight(scene)) if self._reaches(scene.start[i])]
         done = perform(grasper, self.setting.job)
-        success = all(_met(step, scene, there) for step in self.setting.job)
+        success = all(is_met(step, scene, there) for step in self.setting.job)
         stages = [one.outcome.stage for one in done if not one.outcome.success]
         lost = "" if success else LOST_BY.get(stages[0], "grip") if stages else "missed"
         said = next((f"{one.name}: {one.outcome.reason}" for one in done if not one.outcome.success), "")
@@ -247,52 +245,6 @@ class Program:
         """Whether the arm could bring its fingers to a point, were nothing else there."""
         way = self.planner.approach(self._empty, self.planner.arm.home, point, CLEARANCE, 0.0, checked=False)
         return not isinstance(way, str)
-
-
-def _is_put(scene: TabletopScene, which: int, place: Sequence[float] | None, bin: str | None) -> bool:
-    """Whether an object lies where it should be put."""
-    if bin is not None:
-        return bool(scene.in_bin(bin)[which])
-    away = scene.object_poses()[0][which, :2] - np.asarray(place)
-    return bool(np.hypot(*away) <= NEAR and scene.resting()[which])
-
-
-def _met(step: Step, scene: TabletopScene, there: list[int]) -> bool:
-    """Whether a scene is as a step should have left it; `there` are the objects that could be seen and reached."""
-    places, rests = scene.object_poses()[0], scene.resting()
-    kinds = [one.catalogue_object for one in scene.objects]
-    if step.pick == ANY:
-        bins = [kinds[i].name if step.bin == CLASS else str(step.bin) for i in there]
-        return all(scene.in_bin(bin)[i] for i, bin in zip(there, bins, strict=True))
-    mine = [i for i, kind in enumerate(kinds) if kind.name == step.pick and rests[i]]
-    if step.bin is not None:
-        return any(scene.in_bin(step.pick if step.bin == CLASS else step.bin)[i] for i in mine)
-    if step.place is not None:
-        return any(np.hypot(*(places[i, :2] - step.place)) <= NEAR for i in mine)
-    below = [i for i, kind in enumerate(kinds) if kind.name == step.on]
-    return any(
-        np.hypot(*(places[i] - places[j])[:2]) <= kinds[j].radius
-        and abs((places[i] - places[j])[2] - kinds[i].half_height - kinds[j].half_height) < 0.003
-        for i in mine
-        for j in below
-        if i != j
-    )
-
-
-def _lost(outcome: Outcome, held: bool, wrong: bool, scene: TabletopScene, names: list[str], asked: str) -> str:
-    """Where a request was lost: the first stage that was wrong."""
-    if wrong:
-        return "wrong class"
-    if outcome.stage in LOST_BY:
-        return LOST_BY[outcome.stage]
-    if held:
-        return "place"
-    places = scene.start[[name == asked for name in names]]
-    if outcome.position is not None and len(places):
-        off = np.linalg.norm(places - outcome.position, axis=1).min()
-        if off > MISPLACED:
-            return "localization"
-    return "grip"
 
 
 _program: Program

@@ -1,10 +1,22 @@
-"""`Score`: what came of many requests, and where they were lost."""
+"""`Score`: what came of many requests, and where they were lost. Judged by what is true of a scene."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+
+from arm5dof.grasp.jobs import ANY, CLASS, Step
+from arm5dof.grasp.outcome import Outcome
+from arm5dof.grasp.scene import TabletopScene
+
+NEAR = 0.010
+"""From where it should be put it may lie so far, metres."""
+MISPLACED = 0.010
+"""An object that was thought so far from its place was lost by localization, metres."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +74,52 @@ class Score:
             "unreachable_told": sum(one.success for one in others),
             "failures": self.failures,
         }
+
+
+def is_put(scene: TabletopScene, which: int, place: Sequence[float] | None, bin: str | None) -> bool:
+    """Whether an object lies where it should be put."""
+    if bin is not None:
+        return bool(scene.in_bin(bin)[which])
+    away = scene.object_poses()[0][which, :2] - np.asarray(place)
+    return bool(np.hypot(*away) <= NEAR and scene.resting()[which])
+
+
+def is_met(step: Step, scene: TabletopScene, there: list[int]) -> bool:
+    """Whether a scene is as a step should have left it; `there` are the objects that could be seen and reached."""
+    places, rests = scene.object_poses()[0], scene.resting()
+    kinds = [one.catalogue_object for one in scene.objects]
+    if step.pick == ANY:
+        bins = [kinds[i].name if step.bin == CLASS else str(step.bin) for i in there]
+        return all(scene.in_bin(bin)[i] for i, bin in zip(there, bins, strict=True))
+    mine = [i for i, kind in enumerate(kinds) if kind.name == step.pick and rests[i]]
+    if step.bin is not None:
+        return any(scene.in_bin(step.pick if step.bin == CLASS else step.bin)[i] for i in mine)
+    if step.place is not None:
+        return any(np.hypot(*(places[i, :2] - step.place)) <= NEAR for i in mine)
+    below = [i for i, kind in enumerate(kinds) if kind.name == step.on]
+    return any(
+        np.hypot(*(places[i] - places[j])[:2]) <= kinds[j].radius
+        and abs((places[i] - places[j])[2] - kinds[i].half_height - kinds[j].half_height) < 0.003
+        for i in mine
+        for j in below
+        if i != j
+    )
+
+
+def lost_by(outcome: Outcome, held: bool, wrong: bool, scene: TabletopScene, names: list[str], asked: str) -> str:
+    """Where a request was lost: the first stage that was wrong."""
+    if wrong:
+        return "wrong class"
+    if outcome.stage in LOST_BY:
+        return LOST_BY[outcome.stage]
+    if held:
+        return "place"
+    places = scene.start[[name == asked for name in names]]
+    if outcome.position is not None and len(places):
+        off = np.linalg.norm(places - outcome.position, axis=1).min()
+        if off > MISPLACED:
+            return "localization"
+    return "grip"
 
 
 def table(score: Score) -> str:
