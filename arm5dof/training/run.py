@@ -298,6 +298,15 @@ def resume(
     Raises:
         UserError: Its checkpoint is damaged or was made with other settings, a logger is missing, or another process
             trains it.
+
+    >>> import tempfile
+    >>> from arm5dof import Run, load_config, resume
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> run = Run.create(load_config("kinematic.toml", episodes=400), f"{folder.name}/run")
+    >>> longer = run.extend(episodes=800)
+    >>> resume(longer, loggers=["tensorbord"])  # Said before anything is trained.
+    Traceback (most recent call last):
+    arm5dof.errors.UserError: no logger 'tensorbord': did you mean 'tensorboard'?
     """
     ready = make_loggers(loggers)
     with run.locked():

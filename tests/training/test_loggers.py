@@ -88,10 +88,12 @@ def curves(run: Run) -> dict[str, list[tuple[int, float]]]:
 
 def sent(run: Run) -> list[dict[str, str]]:
     """The rows in a run's offline files of Weights & Biases, oldest first, their values as JSON."""
+    import wandb
     from wandb.proto.wandb_internal_pb2 import Record
 
+    wandb.teardown()  # Its own process writes the files.
     rows = []
-    for path in sorted(run.folder.glob("wandb/offline-run-*/*.wandb"), key=lambda path: path.stat().st_mtime_ns):
+    for path in sorted(run.folder.glob("wandb/offline-run-*/*.wandb")):
         data, at, parts = path.read_bytes(), 7, b""  # LevelDB's log format: blocks of 32 KiB, headers of 7 bytes.
         while at + 7 <= len(data):
             if 2**15 - at % 2**15 < 7:
