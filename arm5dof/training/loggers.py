@@ -12,6 +12,7 @@ import uuid
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from arm5dof.errors import UserError, nearest_hint
@@ -153,6 +154,7 @@ class TensorBoard:
         import tensorboard.summary.writer.record_writer  # noqa: F401
 
         self._writer: Any = None
+        self._void: list[Path] = []
 
     def start(self, run: Run, history: Sequence[Point]) -> None:
         from tensorboard.compat.proto.event_pb2 import SessionLog
@@ -169,8 +171,7 @@ class TensorBoard:
         self._write(summary=hparams_pb(_plain(run)))
         for step, values in history:
             self.log(step, values)
-        for path in before:
-            path.unlink()
+        self._void = before
 
     def log(self, step: int, values: Values) -> None:
         from tensorboard.compat.proto.summary_pb2 import Summary
@@ -187,6 +188,8 @@ class TensorBoard:
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+        for path in self._void:  # Only now: a TensorBoard that is open has to have gone on to the new file.
+            path.unlink(missing_ok=True)
 
 
 class Wandb:

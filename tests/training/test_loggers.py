@@ -130,16 +130,32 @@ def test_tensorboard_shows_a_resumed_run_whole_and_once(run: Run):
 
 
 def test_a_tensorboard_that_is_open_forgets_what_is_void(run: Run):
-    """Also what was not removed, since the process was killed before it came to that, is not shown."""
     with logging(run, make_loggers("tensorboard"), [], []) as log:
         for steps in (8, 16, 24):
             log.epoch(row(steps, steps))
-    (first,) = (run.folder / "tensorboard").iterdir()
-    before = first.read_bytes()
     with logging(run, make_loggers("tensorboard"), [row(8, 8)], []) as log:
-        first.write_bytes(before)
         log.epoch(row(16, 16.5))
-    assert curves(run)["train/reward"] == [(16, 8), (32, 16.5)]
+        assert len(list((run.folder / "tensorboard").iterdir())) == 2
+        assert curves(run)["train/reward"] == [(16, 8), (32, 16.5)]
+    assert len(list((run.folder / "tensorboard").iterdir())) == 1
+
+
+def test_what_tensorboard_had_outlives_a_failure_to_write_it_anew(run: Run, monkeypatch: pytest.MonkeyPatch):
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    with logging(run, make_loggers("tensorboard"), [], []) as log:
+        log.epoch(row(8, 8))
+
+    def full(self: RecordWriter, data: bytes) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(RecordWriter, "write", full)
+    with (
+        pytest.warns(UserWarning, match="no longer logged by TensorBoard \\(No space left on device\\)"),
+        logging(run, make_loggers("tensorboard"), [row(8, 8)], []) as log,
+    ):
+        log.epoch(row(16, 16))
+    assert curves(run)["train/reward"] == [(8 * 2, 8)]
 
 
 def test_tensorboard_knows_the_settings(run: Run):
