@@ -63,8 +63,8 @@ def declare(commands: argparse._SubParsersAction) -> None:
         "--log",
         action="append",
         metavar="NAME",
-        help="where the curves go besides metrics.csv: tensorboard, wandb (offline with WANDB_MODE=offline), or both "
-        "by a comma; each is an extra: pip install 'arm5dof[tensorboard]'",
+        help="where the curves go besides metrics.csv: tensorboard, wandb (offline: WANDB_MODE=offline), or both with "
+        "a comma between; each is an extra: pip install 'arm5dof[tensorboard]'",
     )
     p.set_defaults(run=run, parser=p)
 

@@ -137,12 +137,12 @@ class Run:
         (800, 800)
         """
         settings = config.override(self.config, changes)
-        now, others = settings.flat(), config.may_change(self.config)
-        changed = {name for name, value in self.config.flat().items() if now[name] != value}
-        if shaped := [name for name in changed if name not in others]:
+        before, now, others = self.config.flat(), settings.flat(), config.may_change(self.config)
+        changed = {name for name in before if now[name] != before[name]}
+        if shaped := sorted(changed - others.keys()):
             raise UserError(
-                f"{self.folder} was made with {', '.join(f'{n} = {self.config.flat()[n]!r}' for n in sorted(shaped))}: "
-                f"leave out {', '.join(sorted(shaped))}; what may change is {', '.join(others)}"
+                f"{self.folder} was made with {', '.join(f'{name} = {before[name]!r}' for name in shaped)}: leave out "
+                f"{', '.join(shaped)}; what may change is {', '.join(others)}"
             )
         extended = Run(self.folder, settings, self.left_open - changed)
         with self.locked():
