@@ -25,6 +25,7 @@ _HOMES = {
     "load_policy": "arm5dof.training.policy_file",
     "locate": "arm5dof.vision.localization",
     "make_env": "arm5dof.training.config",
+    "resume": "arm5dof.training.run",
     "train": "arm5dof.training.run",
 }
 
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from arm5dof.training.policy import Policy as Policy
     from arm5dof.training.policy_file import load_policy as load_policy
     from arm5dof.training.run import Run as Run
+    from arm5dof.training.run import resume as resume
     from arm5dof.training.run import train as train
     from arm5dof.vision.camera import Camera as Camera
     from arm5dof.vision.detections import Detections as Detections

@@ -27,10 +27,14 @@ a folder with its configuration, its robot, metrics, checkpoints, a figure and r
   arm5dof train my.toml                             your own task: [env] task = "my_module:MyTask"
   arm5dof train --smoke                             a minute on a laptop, to see that everything works
   arm5dof train --resume runs/reach                 go on with a run that was stopped
+  arm5dof train --resume runs/reach --episodes 800  a longer budget for it
+  arm5dof train --log tensorboard                   curves in runs/reach/tensorboard too; tensorboard --logdir runs
   arm5dof train my.toml --help                      the settings of that experiment's task
 
 A resumed run may have other episodes, evaluate_every, checkpoint_every, targets, interim_targets, and
-correction, branches, restarts and refinements in its config.toml; every other setting is as it was.
+correction, branches, restarts and refinements; every other setting is as it was. More episodes stretch what
+falls over the training: 400 of 400 become 400 of 800, and step sizes, noise and the share of random actions
+rise again to where they stand half-way.
 """
 
 SMOKE = {
@@ -48,13 +52,20 @@ SMOKE = {
 def declare(commands: argparse._SubParsersAction) -> None:
     """Add `train` to the commands."""
     # The experiment is not declared: next to settings that argparse does not know it would swallow their values.
-    usage = "arm5dof train [EXPERIMENT.toml] [--SETTING VALUE ...] [--out DIR] [--resume DIR] [--smoke]"
+    usage = "arm5dof train [EXPERIMENT.toml] [--SETTING VALUE ...] [--out DIR] [--resume DIR] [--smoke] [--log NAME]"
     p = commands.add_parser("train", help="train a policy", usage=usage, description=HELP, add_help=False)
     # Help lists the settings, and importing those takes JAX, so only help pays for it.
     p.add_argument("-h", "--help", action="store_true", help="show this help, every setting included")
     p.add_argument("--out", type=Path, metavar="DIR", help="the run's folder; default: runs/<experiment>")
     p.add_argument("--resume", type=Path, metavar="DIR", help="go on with the run in this folder")
     p.add_argument("--smoke", action="store_true", help="a short run with small batches")
+    p.add_argument(
+        "--log",
+        action="append",
+        metavar="NAME",
+        help="where the curves go besides metrics.csv: tensorboard, wandb (offline: WANDB_MODE=offline), or both with "
+        "a comma between; each is an extra: pip install 'arm5dof[tensorboard]'",
+    )
     p.set_defaults(run=run, parser=p)
 
 
@@ -68,15 +79,19 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     from arm5dof.training import run as runs
     from arm5dof.training.checkpoint import silence_abandoned_writes
     from arm5dof.training.evaluate import tables
+    from arm5dof.training.loggers import make_loggers
 
     silence_abandoned_writes()
 
+    loggers = make_loggers(",".join(args.log)) if args.log else []
     if args.resume is not None:
         others = [name for name, value in (("EXPERIMENT", experiment), ("--out", args.out)) if value]
-        others += [f"--{name}" for name in texts] + ["--smoke"] * args.smoke
+        others += ["--smoke"] * args.smoke
         if others:
             raise UserError(f"--resume goes on with a run as it was configured; leave out {', '.join(others)}")
         current = runs.Run.open(args.resume)
+        _check_options(current.config, texts)
+        current = current.extend(**texts) if texts else current
         trainer = None
     else:
         experiment = experiment or "reach.toml"
@@ -90,7 +105,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     print(f"run {current.folder} on {runs.device()}", file=sys.stderr)
     try:
         with Bar("training", current.config.train.episodes, "episodes") as bar:
-            runs.resume(current, bar, trainer)
+            runs.resume(current, bar, trainer, loggers)
     except UserError as error:
         if args.resume is None and current.has_checkpoint:
             raise UserError(f"{error}; go on with arm5dof train --resume {current.folder}") from None
@@ -104,6 +119,16 @@ def _configure(experiment: str, texts: dict[str, str], smoke: bool) -> Config:
     from arm5dof.training import config
 
     found = config.load_config(experiment)
+    given = _check_options(found, texts)
+    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
+    return config.override(found, {**short, **texts})
+
+
+def _check_options(found: Config, texts: dict[str, str]) -> set[str]:
+    """The names of the settings that a command line gives. Raises `UserError`, in its terms, for an unknown one or one
+    without a value."""
+    from arm5dof.training import config
+
     fields = config.fields(found)
     try:
         given = {config.find(name, fields).name for name in texts}
@@ -113,8 +138,7 @@ def _configure(experiment: str, texts: dict[str, str], smoke: bool) -> Config:
     for name, value in texts.items():
         if not value:
             raise UserError(f"--{name} needs a value")
-    short = {name: value for name, value in SMOKE.items() if smoke and name not in given}
-    return config.override(found, {**short, **texts})
+    return given
 
 
 def _experiment_and_settings(rest: list[str]) -> tuple[str | None, dict[str, str]]:

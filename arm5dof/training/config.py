@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -155,10 +155,14 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
         raise UserError(f"{source}: {error}" if source else str(error)) from None
 
 
-def dumps(config: Config) -> str:
-    """The configuration as TOML, every field spelled out."""
-    sections = {name: dataclasses.asdict(getattr(config, name)) for name in SECTIONS}
-    return tomli_w.dumps({**sections, "env": {"task": config.task, **sections["env"]}})
+def dumps(config: Config, left_open: Collection[str] = ()) -> str:
+    """The configuration as TOML, every field spelled out but those of the full names `left_open`."""
+    sections: dict[str, dict[str, Any]] = {name: {} for name in SECTIONS}
+    for full_name, value in config.flat().items():
+        section, _, name = full_name.partition(".")
+        if full_name not in left_open:
+            sections[section][name] = value
+    return tomli_w.dumps(sections)
 
 
 def task_class(task: str, folder: Path | None = None) -> type[Task]:

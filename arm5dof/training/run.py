@@ -1,7 +1,7 @@
 """A run and its folder, which holds all that it takes to go on or to answer, anywhere:
 
 `config.toml`, `run.json` (versions), `model.mjb.gz` and `model.zip` (the robot), `metrics.csv`, `evaluations.json`,
-`checkpoints/`, `learning.png` and `report.md`.
+`checkpoints/`, `learning.png` and `report.md`; with loggers `tensorboard/`, `wandb/` and `wandb.json`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import fcntl
 import json
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +28,7 @@ from arm5dof.runtime.tables import Table
 from arm5dof.training import config, evaluate, report, robot, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import Config, make_env
+from arm5dof.training.loggers import Logger, logging, make_loggers
 from arm5dof.training.policy import Policy
 from arm5dof.training.trainer import Trainer
 
@@ -114,6 +115,48 @@ class Run:
         stated = {f"{section}.{name}" for section, given in values.items() for name in given}
         return Run(folder, settings, frozenset(settings.flat().keys() - stated))
 
+    def extend(self, **changes: Any) -> Run:
+        """The run with a longer budget, or others of its settings that may change. Its `config.toml` keeps them.
+
+        Step sizes, noise and the share of random actions are functions of the share of the budget that is done. A
+        longer budget stretches them: 400 of 400 episodes become 400 of 800, and they rise again to where they stand
+        half-way.
+
+        Args:
+            changes: Values by name, as `load_config` takes them: `episodes=800`.
+
+        Raises:
+            UserError: A setting is unknown, invalid or one that may not change, the run is beyond the budget already,
+                its checkpoint cannot be used, or another process trains it. The run is as it was.
+
+        >>> import tempfile
+        >>> from arm5dof import Run, load_config
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> run = Run.create(load_config("kinematic.toml", episodes=400), f"{folder.name}/run")
+        >>> run.extend(episodes=800).config.train.episodes, Run.open(run.folder).config.train.episodes
+        (800, 800)
+        """
+        settings = config.override(self.config, changes)
+        before, now, others = self.config.flat(), settings.flat(), config.may_change(self.config)
+        changed = {name for name in before if now[name] != before[name]}
+        if shaped := sorted(changed - others.keys()):
+            raise UserError(
+                f"{self.folder} was made with {', '.join(f'{name} = {before[name]!r}' for name in shaped)}: leave out "
+                f"{', '.join(shaped)}; what may change is {', '.join(others)}"
+            )
+        extended = Run(self.folder, settings, self.left_open - changed)
+        with self.locked():
+            made, checkpoints = extended.trainer(), extended._checkpoints(read_only=True)
+            checkpoints.check()
+            done = (checkpoints.latest or 0) * settings.train.num_envs // made.env.episode_length
+            if settings.train.episodes < done and "train.episodes" in changed:
+                raise UserError(
+                    f"{self.folder} has trained {done} episodes, more than {settings.train.episodes}: give {done} or "
+                    "more, or train a new run"
+                )
+            files.write_text(self.folder / "config.toml", config.dumps(settings, extended.left_open))
+        return extended
+
     @cached_property
     def env(self) -> Task:
         """The environment, with the robot that the run was made for, whatever happened to its MJCF since."""
@@ -194,7 +237,12 @@ class Run:
         return self._table().html()
 
 
-def train(settings: Config, folder: str | Path | None = None, reporter: Reporter | None = None) -> Run:
+def train(
+    settings: Config,
+    folder: str | Path | None = None,
+    reporter: Reporter | None = None,
+    loggers: str | Iterable[str | Logger] = (),
+) -> Run:
     """Train a new run to its end.
 
     Args:
@@ -202,12 +250,14 @@ def train(settings: Config, folder: str | Path | None = None, reporter: Reporter
         folder: The run's folder, which must not exist; the first free one of `runs/<task>`, `runs/<task>-2`, ... if
             None.
         reporter: Told how it goes.
+        loggers: Where its curves go, such as `["tensorboard", "wandb"]`, or loggers of your own; see
+            `arm5dof.training.loggers`.
 
     Returns:
         The run.
 
     Raises:
-        UserError: The configuration cannot be trained, or the folder exists.
+        UserError: The configuration cannot be trained, a logger is missing, or the folder exists.
 
     >>> import tempfile
     >>> from arm5dof import load_config, train
@@ -218,9 +268,10 @@ def train(settings: Config, folder: str | Path | None = None, reporter: Reporter
     >>> run.evaluations[-1]["episodes"], run.metrics["env_steps"][-1], (run.folder / "report.md").exists()
     (2, 320.0, True)
     """
-    made = make_trainer(settings)  # What is wrong with the robot or the budget is said before a folder exists.
+    # What is wrong with loggers, robot or budget is said before a folder exists.
+    ready, made = make_loggers(loggers), make_trainer(settings)
     run = Run.create(settings, folder or free_folder(settings.task.rpartition(":")[2]), made.env)
-    return resume(run, reporter, made)
+    return resume(run, reporter, made, ready)
 
 
 def make_trainer(settings: Config) -> Trainer:
@@ -230,28 +281,45 @@ def make_trainer(settings: Config) -> Trainer:
     return made
 
 
-def resume(run: Run, reporter: Reporter | None = None, made: Trainer | None = None) -> Run:
-    """Train a run to its end, from its newest checkpoint if it has one.
+def resume(
+    run: Run,
+    reporter: Reporter | None = None,
+    made: Trainer | None = None,
+    loggers: str | Iterable[str | Logger] = (),
+) -> Run:
+    """Train a run to its end, from its newest checkpoint if it has one. `Run.extend` gives it a longer budget before.
 
     Args:
         run: The run.
         reporter: Told how it goes.
         made: Its training program, if it has been made already.
+        loggers: Where its curves go, as for `train`: whole, whoever logged what went before.
 
     Raises:
-        UserError: Its checkpoint is damaged or was made with other settings, or another process trains it.
+        UserError: Its checkpoint is damaged or was made with other settings, a logger is missing, or another process
+            trains it.
+
+    >>> import tempfile
+    >>> from arm5dof import Run, load_config, resume
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> run = Run.create(load_config("kinematic.toml", episodes=400), f"{folder.name}/run")
+    >>> longer = run.extend(episodes=800)
+    >>> resume(longer, loggers=["tensorbord"])  # Said before anything is trained.
+    Traceback (most recent call last):
+    arm5dof.errors.UserError: no logger 'tensorbord': did you mean 'tensorboard'?
     """
+    ready = make_loggers(loggers)
     with run.locked():
         checkpoints, reporter = run._checkpoints(), reporter or Silent()
         # What no longer fits is said before a trainer is made of it.
         if changed := checkpoints.check():
             told = ", ".join(f"{name} {before} -> {now}" for name, (before, now) in changed.items())
             reporter.say(f"changed since the last checkpoint: {told}")
-        _train(run, made or run.trainer(), checkpoints, reporter)
+        _train(run, made or run.trainer(), checkpoints, reporter, ready)
     return run
 
 
-def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter) -> None:
+def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter, loggers: list[Logger]) -> None:
     budget, length = run.config.train, made.env.episode_length
     reporter.update(0, "compiling")
     if checkpoints.latest is None:
@@ -266,19 +334,21 @@ def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter
     before = float(rows[-1]["seconds"]) if rows else 0.0
     started = time.monotonic()
 
-    with _appending(run.folder / "metrics.csv", rows) as write:
+    with _appending(run.folder / "metrics.csv", rows) as write, logging(run, loggers, rows, evaluations) as log:
         while True:
             at = made.counters
             due = at.steps > 0 and at.steps % (budget.evaluate_every // budget.num_envs * length) == 0
             if (due or made.finished) and all(e["steps"] != at.steps for e in evaluations):
                 evaluations.append(_evaluate(run, made, reporter))
                 files.write_text(run.folder / "evaluations.json", json.dumps(evaluations, indent=1) + "\n")
+                log.evaluation(evaluations[-1])
             if made.finished:
                 break
             metrics = made.advance()
             at, seconds = made.counters, time.monotonic() - started
             rows.append(trainer.row(at, before + seconds, metrics))
             write(rows[-1])
+            log.epoch(rows[-1])
             reporter.update(at.episodes, _note(made.env, rows, metrics))
             if at.steps % (budget.checkpoint_every // budget.num_envs * length) == 0 or made.finished:
                 checkpoints.save(made.state)

@@ -29,7 +29,9 @@ class TrainConfig:
     seed: Annotated[int, Ge(0)] = static(default=0)
     """Of all random numbers: same seed and machine, same bits."""
     episodes: Count = static(default=400, may_change=True)
-    """Episodes in all; a multiple of the number of environments."""
+    """Episodes in all; a multiple of the number of environments. A run may be resumed with more: step sizes, noise and
+    the share of random actions follow the share of all episodes that is done, so they rise again, to where they would
+    be by then in a run of the new length."""
     num_envs: Count = static(default=50)
     """Environments that run side by side."""
     epoch_steps: Count = static(default=16)

@@ -217,7 +217,9 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
         (["--epoch-steps", "7"], "does not divide"),
         (["--replay-capacity", "100000000000"], "GB are free: choose a smaller one"),
         (["--resume", "nowhere"], "no run"),
-        (["--resume", "nowhere", "--seed", "3"], "leave out --seed"),
+        (["--resume", "nowhere", "--seed", "3"], "no run"),
+        (["--resume", "nowhere", "--smoke", "--out", "there"], "leave out --out, --smoke"),
+        (["kinematic.toml", "--log", "tensorbord"], "no logger 'tensorbord': did you mean 'tensorboard'?"),
     ],
 )
 def test_train_refuses_bad_input(arguments, said, fails, tmp_path, monkeypatch):
@@ -265,6 +267,30 @@ def test_a_finished_run_resumes_to_the_same_end(trained):
     before = digest(trained / "checkpoints")
     assert run("train", "--resume", trained) == 0
     assert digest(trained / "checkpoints") == before
+
+
+def test_a_longer_budget_and_curves_in_tensorboard(trained, tmp_path, fails):
+    folder = copy(trained, tmp_path / "longer")
+    for option, said in [
+        (["--seed", 3], "leave out train.seed; what may change is env.correction"),
+        (["--episodes", 2], "has trained 4 episodes, more than 2: give 4 or more"),
+        (["--episodes", 7], "no multiple of num_envs"),
+        (["--episode", 8], "unknown option --episode: did you mean --episodes?"),
+        (["--episodes"], "--episodes needs a value"),
+    ]:
+        assert said in fails("train", "--resume", folder, *option)
+    assert digest(folder) == [(path.replace(str(trained), str(folder)), sha) for path, sha in digest(trained)]
+    assert run("train", "--resume", folder, "--episodes", 6, "--log", "tensorboard") == 0
+    assert Run.open(folder).metrics["env_steps"][-1] == 192 and Run.open(folder).config.train.episodes == 6
+    assert len(list((folder / "tensorboard").iterdir())) == 1
+
+
+def test_missing_extras_are_said_before_anything_starts(fails, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    monkeypatch.delitem(sys.modules, "tensorboard.summary.writer.record_writer", raising=False)
+    assert "pip install 'arm5dof[tensorboard]'" in fails("train", "--log", "tensorboard")
+    assert list(tmp_path.iterdir()) == []
 
 
 def copy(folder, target):

@@ -279,6 +279,97 @@ def test_a_run_that_did_all_there_is_left_to_do_ends(runs: dict[str, Path], else
     assert run.evaluations == Run.open(runs["finished"]).evaluations
 
 
+TWENTY = {**TINY, "episodes": 20, "num_envs": 10, "evaluate_every": 10, "checkpoint_every": 10, "targets": 20}
+
+
+@pytest.fixture(scope="module")
+def twenty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of 20 episodes, 32 steps of ten environments."""
+    settings = load_config("kinematic.toml", noise=0.5, final_noise=0.1, **{**TWENTY, "interim_targets": 20})
+    return train(settings, tmp_path_factory.mktemp("runs") / "twenty").folder
+
+
+def test_a_longer_budget_goes_on_and_stretches_the_schedules(twenty: Path, tmp_path: Path):
+    run = Run.open(copy(twenty, tmp_path / "run"))
+    before, evaluations, state = run.metrics, run.evaluations, final_state(run)
+    longer, told = run.extend(episodes="40"), Told()
+    assert Run.open(run.folder) == longer and longer.config == config.override(run.config, {"episodes": 40})
+    kept = final_state(longer)
+    assert all((kept[name] == value).all() for name, value in state.items()), "nothing is trained yet"
+
+    by_hand = longer.trainer()
+    by_hand.state = longer._checkpoints(read_only=True).restore(by_hand.like)
+    while not by_hand.finished:
+        by_hand.advance()
+    resume(longer, told)
+    assert any("resuming" in line and line.endswith("at episode 20") for line in told.lines)
+    assert any(line.endswith("train.episodes 20 -> 40") for line in told.lines)
+    for found, expected in zip(
+        jax.tree.leaves(longer.policy().networks), jax.tree.leaves(by_hand.state.networks), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+    steps = np.array(longer.metrics["steps"])
+    np.testing.assert_array_equal(steps, np.arange(8, 65, 8))
+    assert all(values[:4] == before[name] for name, values in longer.metrics.items()), "what was, stays"
+    assert [e["episodes"] for e in longer.evaluations] == [10, 20, 30, 40] and longer.evaluations[:2] == evaluations
+    done = (steps - 4.5) / np.where(steps <= 32, 32, 64)  # Means over an epoch of the share of all steps done before.
+    np.testing.assert_allclose(longer.metrics["noise"], 0.5 - 0.4 * done, rtol=1e-5)
+    assert by_hand.agent.total_steps == 64, "of which step sizes are the same function: see test_ddpg.py"
+
+
+def test_the_same_budget_is_no_change(twenty: Path, tmp_path: Path):
+    folder = copy(twenty, tmp_path / "run")
+    rows = (folder / "metrics.csv").read_bytes()
+    text = (folder / "config.toml").read_text()
+    run = resume(Run.open(folder).extend(episodes=20, seed=0))
+    assert (folder / "metrics.csv").read_bytes() == rows and (folder / "config.toml").read_text() == text
+    assert run.evaluations == Run.open(twenty).evaluations
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"episodes": 10}, "has trained 20 episodes, more than 10: give 20 or more, or train a new run"),
+        ({"episodes": 45}, "episodes = 45 is no multiple of num_envs = 10"),
+        ({"episodes": "many"}, "train.episodes = 'many': input should be a valid integer"),
+        ({"episodes": 40, "targets": 0}, "evaluate.targets = 0"),
+        ({"episode": 40}, "unknown setting 'episode': did you mean 'episodes'?"),
+        (
+            {"seed": 3, "episodes": 40, "ddpg.batch_size": 8},
+            "was made with ddpg.batch_size = 16, train.seed = 0: leave out ddpg.batch_size, train.seed; what may "
+            "change is env.correction, env.branches, env.restarts, env.refinements, train.episodes, "
+            "train.evaluate_every, train.checkpoint_every, evaluate.targets, evaluate.interim_targets",
+        ),
+    ],
+)
+def test_what_a_run_cannot_become_is_refused(twenty: Path, changes: dict, expected: str):
+    before = (twenty / "config.toml").read_bytes()
+    assert expected in said(lambda: Run.open(twenty).extend(**changes))
+    assert (twenty / "config.toml").read_bytes() == before
+    assert not list(twenty.glob(".config*"))
+
+
+def test_a_run_in_training_or_with_a_damaged_checkpoint_is_not_extended(twenty: Path, tmp_path: Path):
+    folder = copy(twenty, tmp_path / "run")
+    before = (folder / "config.toml").read_bytes()
+    with Run.open(folder).locked():
+        assert "is being trained by another process" in said(lambda: Run.open(folder).extend(episodes=40))
+    for path in folder.glob("checkpoints/*/record/metadata"):
+        path.write_text("garbage")
+    assert "damaged" in said(lambda: Run.open(folder).extend(episodes=40))
+    assert (folder / "config.toml").read_bytes() == before
+
+
+def test_what_an_extended_run_leaves_open_stays_open(twenty: Path, tmp_path: Path):
+    run = forget(copy(twenty, tmp_path / "run"), "ddpg.actor_products", record=True)
+    run = forget(run.folder, "evaluate.targets", record=False)
+    assert run.left_open == {"ddpg.actor_products", "evaluate.targets"}
+    longer = run.extend(targets=30, evaluate_every=20)
+    assert Run.open(run.folder) == longer and longer.left_open == {"ddpg.actor_products"}
+    assert longer.policy().solve(GOALS).q.shape == (3, 5)
+
+
 @pytest.mark.parametrize("harm", ["missing", "garbage", "truncated", "another"])
 def test_a_damaged_robot_is_refused(runs: dict[str, Path], elsewhere: Path, harm: str):
     folder = copy(runs["finished"], elsewhere / "run")
