@@ -111,7 +111,10 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     if path is None:
         names = ", ".join(files.shipped("experiments", ".toml"))
         raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
-    return override(build(_read(path), str(path), path.parent, fill=True), overrides)
+    values = _read(path)
+    if "axes" in values:
+        raise UserError(f"{path} is a sweep, not an experiment: run it with arm5dof sweep {path}")
+    return override(build(values, str(path), path.parent, fill=True), overrides)
 
 
 def override(config: Config, values: Mapping[str, Any]) -> Config:
