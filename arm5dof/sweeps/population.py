@@ -5,6 +5,7 @@ folder like any other; its numbers are those of training it alone within the reo
 from __future__ import annotations
 
 import csv
+import functools
 import json
 import time
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from arm5dof.ddpg import Training
-from arm5dof.runtime import files
+from arm5dof.runtime import files, xla
 from arm5dof.sweeps.worker import DIVERGED, DONE, Ending, finish, not_finite
 from arm5dof.training import config, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
@@ -41,17 +42,7 @@ class Population:
         self.program, self.settings = program, settings
         self._numbers = jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *(s.ddpg for s in settings))
         self._keys = jnp.stack([jax.random.key(s.train.seed) for s in settings])
-        steps, agent, env = settings[0].train.epoch_steps, program.agent, program.env
-
-        def watched(policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
-            return env.watch(policy, jax.random.fold_in(key, trainer.WATCHED))
-
-        def epoch(numbers: Any, state: Training) -> tuple[Training, dict[str, jax.Array]]:
-            return agent.epoch(numbers, state, steps)
-
-        self._init = jax.jit(jax.vmap(agent.init))
-        self._epoch = jax.jit(jax.vmap(epoch), donate_argnums=1)
-        self._watched = jax.jit(jax.vmap(watched))
+        self._init, self._epoch, self._watched = _programs(program)
 
     def start(self) -> None:
         """Begin new trainings."""
@@ -85,6 +76,24 @@ class Population:
         steps, updates = int(self.state.steps[0]), int(self.state.updates[0])
         env_steps = steps * self.settings[0].train.num_envs
         return Counters(steps, env_steps // self.program.env.episode_length, env_steps, updates)
+
+
+@functools.lru_cache(1)
+def _programs(program: Trainer) -> tuple[Any, Any, Any]:
+    """`init`, `epoch` and `watch` of many, kept from chunk to chunk."""
+    steps, agent, env = program.config.train.epoch_steps, program.agent, program.env
+
+    def watched(policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
+        return env.watch(policy, jax.random.fold_in(key, trainer.WATCHED))
+
+    def epoch(numbers: Any, state: Training) -> tuple[Training, dict[str, jax.Array]]:
+        return agent.epoch(numbers, state, steps)
+
+    return (
+        jax.jit(jax.vmap(agent.init), compiler_options=xla.effort(0)),
+        jax.jit(jax.vmap(epoch), donate_argnums=1, compiler_options=xla.effort(2)),
+        jax.jit(jax.vmap(watched)),
+    )
 
 
 class _Folder(NamedTuple):

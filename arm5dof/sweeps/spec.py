@@ -27,6 +27,7 @@ import tomllib
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -83,15 +84,16 @@ class Spec:
 
     base: Config
     axes: dict[str, Axis]
-    """By full name of the setting, such as `ddpg.actor_lr`."""
+    """By full name of the setting, such as `ddpg.actor_lr`, in the order in which settings are declared: TOML keeps
+    none, and members are numbered by it."""
     search: Search | None
     sample_seed: int
     source: Mapping[str, Any]
     """The tables of the TOML file that say all this."""
 
-    @property
+    @cached_property
     def members(self) -> list[Member]:
-        """Every combination of the axes' values, the last axis first; none where configurations are searched for."""
+        """Every combination of the axes' values, the last axis varying first; none where there is a search."""
         if self.search:
             return []
         names, count = list(self.axes), math.prod(len(axis.values) for axis in self.axes.values())
@@ -183,6 +185,7 @@ def parse(values: Mapping[str, Any], folder: Path | None = None) -> Spec:
     if search is None and count > MOST:
         raise UserError(f"{count} members are more than {MOST}: choose fewer values, or a [search]")
     source = {**{k: v for k, v in values.items() if k not in ("base", "axes")}, "axes": dict(given)}
+    axes = {name: axes[name] for name in base.flat() if name in axes}
     made = Spec(base, axes, search, sample_seed or 0, source)
     for full, axis in axes.items():  # Values are checked one by one: errors name them, and a search has no members.
         _check_values(made, full, axis)

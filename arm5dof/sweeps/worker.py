@@ -107,7 +107,7 @@ class Worker:
 
             todo = [(name, _built(text)) for name, text in job.members if not ended(folder, name)]
             if todo:
-                ending = attempt(lambda: train_together(self.trainer(todo[0][1]), folder, todo))
+                ending = attempt(lambda: train_together(self._program(todo[0][1]), folder, todo))
                 for name in [name for name, _ in todo if not ended(folder, name)]:
                     finish(folder, name, ending)
             return
@@ -126,14 +126,15 @@ class Worker:
             if job.trial is not None and found.status != DONE:
                 decided = f"{name} {found.status}"
 
-    def trainer(self, settings: Config) -> Trainer:
-        """A training program for a configuration: the one at hand if it is of the same shape."""
+    def _program(self, settings: Config) -> Trainer:
+        """A training program for configurations of a shape: the one at hand if it is of that."""
         wanted = shape(settings)
         if self._trainer is None or wanted != self._shape:
-            self._trainer = None
-            jax.clear_caches()
+            if self._trainer is not None:
+                self._trainer = None
+                jax.clear_caches()
             self._trainer, self._shape = Finite(config.make_env(settings), settings), wanted
-        return self._trainer.again(settings)
+        return self._trainer
 
     def _train(self, folder: Path, settings: Config, stop: Callable[[Run], bool] | None) -> None:
         """As `training.run.train` does, or `resume` where there is a run."""
@@ -145,8 +146,7 @@ class Worker:
         else:
             for leftover in folder.parent.glob(f".{folder.name}-*"):  # Of one that was killed while it made its folder.
                 shutil.rmtree(leftover, ignore_errors=True)
-            made = self.trainer(settings)
-            made.check()
+            made = self._program(settings).again(settings)
             opened = Run.create(settings, folder, made.env)
         run.resume(opened, _Stopping(opened, stop) if stop else None, made)
 

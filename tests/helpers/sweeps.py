@@ -6,6 +6,9 @@ from pathlib import Path
 from typing import Any
 
 TASK = '''
+import os
+import signal
+
 import jax
 import jax.numpy as jnp
 
@@ -20,6 +23,8 @@ class PushConfig:
 
     episode_length: int = static(default=8)
     """Steps in an episode."""
+    trouble: str = static(default="")
+    """raise or kill: what the environment does when it is checked."""
 
 
 class Push(Task):
@@ -27,6 +32,12 @@ class Push(Task):
 
     Config = PushConfig
     action_size = 1
+
+    def check(self):
+        if self.config.trouble == "raise":
+            raise RuntimeError("no such luck")
+        if self.config.trouble == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
 
     def reset(self, key):
         return self._state(jax.random.uniform(key, (1,), minval=-1.0, maxval=1.0))
