@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers.sweeps import toy
+from helpers.sweeps import environment, toy
 
 from arm5dof import Sweep, load_config, load_policy
 from arm5dof.cli import main as cli
@@ -98,7 +98,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(tmp_path):
     toy(tmp_path)
     (tmp_path / "s.toml").write_text('base = "toy.toml"\n[axes]\nseed = { count = 50 }\n')
     command = [sys.executable, "-m", "arm5dof", "sweep", "s.toml", "--out", "out", "--workers", "1"]
-    started = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    started = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
     while not list(tmp_path.glob("out/members/m*.json")) and started.poll() is None:
         time.sleep(0.1)
     os.kill(started.pid, signal.SIGINT)

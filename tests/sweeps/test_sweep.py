@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 from helpers.errors import said
-from helpers.sweeps import same, toy
+from helpers.sweeps import environment, same, toy
 
 from arm5dof import Run, Sweep, compare, load_config, make_env, sweep
 from arm5dof.sweeps import local, spec
@@ -139,7 +139,7 @@ def test_whatever_is_killed_the_table_is_the_same(done, asked, experiment, tmp_p
     out, moments = tmp_path / "killed", random.Random(0)
     code = f"from arm5dof import sweep; sweep({asked!r}, {str(out)!r}, workers=2, resume=True)"
     for members in (0, 2):
-        driver = subprocess.Popen([sys.executable, "-c", code])
+        driver = subprocess.Popen([sys.executable, "-c", code], env=environment())
         enough = lambda n=members: len(list((out / "members").glob("*.json"))) >= n and list(out.glob("members/m*"))
         while driver.poll() is None and not enough():
             time.sleep(0.05)
