@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
-from arm5dof.sweeps import figures, report, results
+from arm5dof.sweeps import figures, results
 from arm5dof.sweeps.folder import Sweep
-from arm5dof.sweeps.results import Row
 from arm5dof.sweeps.spec import SEED, Member
 from arm5dof.sweeps.summary import Headline, estimate, spelled_estimate
 from arm5dof.sweeps.worker import DONE
+from arm5dof.training.report import STYLE, save
 from arm5dof.training.run import Run
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class Comparison:
         curves: The rows of each run's evaluations, or of each configuration's members, by label.
     """
 
-    def __init__(self, headline: Headline, curves: dict[str, list[Row]]) -> None:
+    def __init__(self, headline: Headline, curves: figures.Curves) -> None:
         self.headline, self.curves = headline, curves
 
     @property
@@ -48,15 +49,11 @@ class Comparison:
         """How they learnt."""
         import matplotlib
 
-        from arm5dof.training.report import STYLE
-
         with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
             return figures.learning(self.curves, self.headline)
 
     def save(self, path: str | Path) -> None:
         """Write the figure as PNG."""
-        from arm5dof.training.report import save
-
         save(self.figure(), Path(path))
 
     def __repr__(self) -> str:
@@ -87,7 +84,7 @@ def compare(*folders: str | Path) -> Comparison:
     if not folders:
         raise UserError("compare takes folders of runs and sweeps")
     headline: Headline | None = None
-    curves: dict[str, list[Row]] = {}
+    curves: dict[str, Sequence[Mapping[str, Any]]] = {}
     for path in map(Path, folders):
         judged, found = _curves(path)
         if headline is not None and judged != headline:
@@ -105,12 +102,12 @@ def compare(*folders: str | Path) -> Comparison:
     return Comparison(headline, curves)
 
 
-def _curves(path: Path) -> tuple[Headline, dict[str, list[Row]]]:
+def _curves(path: Path) -> tuple[Headline, figures.Curves]:
     """What a folder is judged by, and its curves by label."""
     if (path / "sweep.json").is_file():
         opened = Sweep.open(path)
         rows = opened.table
-        return opened.headline, report.curves(rows, opened.summary(rows), f"{path}: ")
+        return opened.headline, figures.curves(rows, opened.summary(rows), f"{path}: ")
     if not (path / "run.json").is_file():
         raise UserError(f"{path} is neither a run nor a sweep: give folders that arm5dof train or sweep left")
     run = Run.open(path)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arm5dof.sweeps.summary import Headline, Line, curve, short, spelled
+from arm5dof.training.report import STYLE, axes_over_episodes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,10 +22,28 @@ Curves = Mapping[str, Sequence[Mapping[str, Any]]]
 """By label, the rows of the members that a curve is of."""
 
 
+def drawn(rows: Sequence[Mapping[str, Any]], lines: Sequence[Line], headline: Headline) -> dict[str, Figure]:
+    """A sweep's figures by name: `learning`, and `axes` where there are others than seeds."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+        found = {"learning": learning(curves(rows, lines), headline)}
+        axes = axes_figure(lines, headline)
+    return found if axes is None else {**found, "axes": axes}
+
+
+def curves(rows: Sequence[Mapping[str, Any]], lines: Sequence[Line], prefix: str = "") -> Curves:
+    """The rows of each configuration, the best first, by what tells it apart."""
+    return {
+        prefix + (", ".join(f"{short(k)} {spelled(v)}" for k, v in line.settings.items()) or "all seeds"): [
+            row for row in rows if all(row[name] == value for name, value in line.settings.items())
+        ]
+        for line in lines
+    }
+
+
 def learning(curves: Curves, headline: Headline) -> Figure:
     """The headline against episodes: interquartile means over members, and their confidence intervals as bands."""
-    from arm5dof.training.report import axes_over_episodes
-
     figure, axes = axes_over_episodes(headline.label)
     for label, rows in itertools.islice(curves.items(), MOST_CURVES):
         episodes, found = curve(rows)

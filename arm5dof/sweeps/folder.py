@@ -13,15 +13,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.runtime.tables import Table
-from arm5dof.sweeps import results, spec, summary
+from arm5dof.sweeps import figures, results, spec, summary
 from arm5dof.sweeps.results import Row
 from arm5dof.sweeps.spec import Member, Spec
 from arm5dof.sweeps.summary import Headline, Line
 from arm5dof.training.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PATIENCE_S = 20.0
 """Workers of a sweep that was killed end a little later than it did."""
@@ -111,6 +115,11 @@ class Sweep:
         higher = self.headline.metric.higher_is_better
         rows = self.table if rows is None else rows
         return summary.summarise(rows, higher, self.spec.axes, self.spec.sample_seed)
+
+    def figures(self) -> dict[str, Figure]:
+        """Its figures: `learning`, how configurations learnt, and `axes`, what the axes are worth, if it has some."""
+        rows = self.table
+        return figures.drawn(rows, self.summary(rows), self.headline)
 
     @property
     def best(self) -> Run:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Any
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.sweeps import figures, results, summary
 from arm5dof.sweeps.folder import Sweep
-from arm5dof.sweeps.results import Row
-from arm5dof.sweeps.summary import Line, short, spelled
-from arm5dof.training import config
+from arm5dof.training import config, report
 from arm5dof.training.policy_file import save_policy
 from arm5dof.training.run import Run
 
@@ -24,38 +21,16 @@ def write(current: Sweep, say: Callable[[str], object]) -> None:
         current: The sweep.
         say: Told what could not be written.
     """
-    import matplotlib
-
-    from arm5dof.training import report
-
     rows = current.table
     results.write(current.folder, rows)
     lines = current.summary(rows)
     found = summary.table(f"Sweep {current.folder.name}", lines, current.headline)
     files.write_text(current.folder / "summary.md", f"# {found.title}\n\n{found.markdown()}\n")
-    with matplotlib.rc_context(report.STYLE):  # type: ignore[arg-type]
-        for name, figure in drawn(current, rows, lines).items():
-            report.save(figure, current.folder / f"{name}.png")
+    for name, figure in figures.drawn(rows, lines, current.headline).items():
+        report.save(figure, current.folder / f"{name}.png")
     best = next((line.best for line in lines if line.best), None)
     if best is not None:
         _write_best(current, best, say)
-
-
-def drawn(current: Sweep, rows: list[Row], lines: list[Line]) -> dict[str, Any]:
-    """A sweep's figures by name: `learning`, and `axes` where there are others than seeds."""
-    found = {"learning": figures.learning(curves(rows, lines), current.headline)}
-    axes = figures.axes_figure(lines, current.headline)
-    return found if axes is None else {**found, "axes": axes}
-
-
-def curves(rows: list[Row], lines: list[Line], prefix: str = "") -> dict[str, list[Row]]:
-    """The rows of each configuration, the best first, by what tells it apart."""
-    return {
-        prefix + (", ".join(f"{short(k)} {spelled(v)}" for k, v in line.settings.items()) or "all seeds"): [
-            row for row in rows if all(row[name] == value for name, value in line.settings.items())
-        ]
-        for line in lines
-    }
 
 
 def _write_best(current: Sweep, best: str, say: Callable[[str], object]) -> None:
