@@ -25,6 +25,9 @@ member, which is a run like any other. Any setting of any task can be an axis:
   seed = { count = 4 }                                 # 0, 1, 2, 3
   [fixed]
   episodes = 100                                       # another value than the experiment's, for all
+  [variants]                                           # optional: named sets of settings, one more axis
+  "the recipe" = {}
+  "no noise" = { noise = 0, final_noise = 0 }
   [search]                                             # optional: look for the best instead of training all
   method = "tpe"                                       # or "random"
   trials = 50                                          # configurations, each with every seed

@@ -37,6 +37,16 @@ class Sweep:
     Attributes:
         folder: The folder.
         spec: What it was asked for.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from arm5dof import Sweep
+    >>> from arm5dof.sweeps.spec import parse
+    >>> asked = parse({"base": "kinematic.toml", "axes": {"noise": [0.1, 0.2], "seed": {"count": 2}}})
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> begun = Sweep.create(asked, Path(folder.name) / "noise")
+    >>> [(row["member"], row["ddpg.noise"], row["train.seed"], row["status"]) for row in begun.table][:2]
+    [('m0000', 0.1, 0, 'missing'), ('m0001', 0.1, 1, 'missing')]
     """
 
     def __init__(self, folder: Path, asked: Spec) -> None:

@@ -26,7 +26,7 @@ import math
 import tomllib
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -42,7 +42,8 @@ from arm5dof.training import config
 from arm5dof.training.config import SECTIONS, Config
 
 SEED = "train.seed"
-TABLES = ("base", "sample_seed", "axes", "fixed", "search")
+VARIANT = "variant"
+TABLES = ("base", "sample_seed", "axes", "variants", "fixed", "search")
 MOST = 100_000
 """Members: more are a mistake."""
 
@@ -74,7 +75,7 @@ class Member(NamedTuple):
 
     name: str
     settings: dict[str, Any]
-    """The settings by which members differ, by full name, the seed included."""
+    """The settings by which members differ, by full name, the seed included; and the name of the `variant`."""
     config: Config
 
 
@@ -86,6 +87,8 @@ class Spec:
     axes: dict[str, Axis]
     """By full name of the setting, such as `ddpg.actor_lr`, in the order in which settings are declared: TOML keeps
     none, and members are numbered by it."""
+    variants: dict[str, dict[str, Any]]
+    """Sets of settings by full name, by the names that are the values of the axis `variant`."""
     search: Search | None
     sample_seed: int
     source: Mapping[str, Any]
@@ -106,12 +109,10 @@ class Spec:
 
     def member(self, name: str, values: Mapping[str, Any]) -> Member:
         """A member with some values of the axes. Raises `UserError` for a value that its setting cannot have."""
-        return self.as_member(name, config.override(self.base, values))
-
-    def as_member(self, name: str, settings: Config) -> Member:
-        """A member of a given configuration."""
-        flat = settings.flat()
-        return Member(name, {key: flat[key] for key in dict.fromkeys([*self.axes, SEED])}, settings)
+        given = {name: value for name, value in values.items() if name != VARIANT}
+        changed = config.override(self.base, {**self.variants.get(values.get(VARIANT, ""), {}), **given})
+        flat = {**changed.flat(), VARIANT: values.get(VARIANT)}
+        return Member(name, {key: flat[key] for key in dict.fromkeys([*self.axes, SEED])}, changed)
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -125,10 +126,12 @@ class Spec:
 
     def same_as(self, other: Spec) -> bool:
         """Whether results of one are results of the other. A search may go on for more trials."""
-        searched = [None if spec.search is None else (spec.search.method, spec.search.prune) for spec in (self, other)]
-        return (self.base, self.axes, self.sample_seed) == (other.base, other.axes, other.sample_seed) and (
-            searched[0] == searched[1]
-        )
+        return self._identity == other._identity
+
+    @property
+    def _identity(self) -> object:
+        search = self.search and replace(self.search, trials=1)
+        return self.base, self.axes, self.variants, list(self.variants), self.sample_seed, search
 
 
 def read(path: str | Path) -> Spec:
@@ -139,7 +142,8 @@ def read(path: str | Path) -> Spec:
     """
     found = files.find("experiments", path)
     if found is None:
-        raise UserError(f"no sweep {str(path)!r}: give a TOML file, or one that ships, such as sweep_smoke.toml")
+        names = ", ".join(name for name in files.shipped("experiments", ".toml") if name.startswith("sweep_"))
+        raise UserError(f"no sweep {str(path)!r}: give a TOML file, or one of those shipped: {names}")
     try:
         values = tomllib.loads(found.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
@@ -164,20 +168,26 @@ def parse(values: Mapping[str, Any], folder: Path | None = None) -> Spec:
         if table not in TABLES:
             raise UserError(f"unknown table {table!r} of a sweep: {nearest_hint(table, TABLES)}")
     given, fixed = (_flat(name, values.get(name, {})) for name in ("axes", "fixed"))
-    if "base" not in values or not given:
+    stated = values.get("variants", {})
+    if not isinstance(stated, Mapping) or not all(isinstance(v, Mapping) for v in stated.values()):
+        raise UserError('variants: it should be a table [variants] of "NAME" = { SETTING = VALUE }')
+    if "base" not in values or not (given or stated):
         raise UserError('a sweep names its base experiment, base = "NAME.toml", and has [axes] with one at least')
     sample_seed = values.get("sample_seed")
     if sample_seed is not None and (not isinstance(sample_seed, int) or sample_seed < 0):
         raise UserError(f"sample_seed = {sample_seed!r}: it should be a whole number, 0 or more")
     base = _base(values["base"], folder)
-    named = _by_full_name(base, fixed)
+    named = _by_full_name(base, fixed, "[fixed]")
     base = config.override(base, named)
+    variants = {name: _by_full_name(base, _flat(name, v), f"variant {name!r}") for name, v in stated.items()}
     search = _search(values.get("search"))
     axes: dict[str, Axis] = {}
     for name, said in given.items():
-        (full,) = _by_full_name(base, {name: None})
-        if full in axes or full in named:
-            raise UserError(f"{full} is set twice: it is an axis, and {'fixed' if full in named else 'another axis'}")
+        (full,) = _by_full_name(base, {name: None}, "[axes]")
+        others = {**dict.fromkeys(axes, "another axis"), **dict.fromkeys(named, "fixed")}
+        others |= {key: f"set by variant {v!r}" for v, changed in variants.items() for key in changed}
+        if full in others:
+            raise UserError(f"{full} is set twice: it is an axis, and {others[full]}")
         axes[full] = _axis(name, full, said, sample_seed, search)
     if sample_seed is None and search is not None:
         raise UserError("a search is random: say sample_seed = 0, so that it can be repeated")
@@ -186,7 +196,9 @@ def parse(values: Mapping[str, Any], folder: Path | None = None) -> Spec:
         raise UserError(f"{count} members are more than {MOST}: choose fewer values, or a [search]")
     source = {**{k: v for k, v in values.items() if k not in ("base", "axes")}, "axes": dict(given)}
     axes = {name: axes[name] for name in base.flat() if name in axes}
-    made = Spec(base, axes, search, sample_seed or 0, source)
+    if variants:
+        axes = {VARIANT: Axis(tuple(variants)), **axes}
+    made = Spec(base, axes, variants, search, sample_seed or 0, source)
     for full, axis in axes.items():  # Values are checked one by one: errors name them, and a search has no members.
         _check_values(made, full, axis)
     _ = made.members
@@ -215,14 +227,14 @@ def _base(given: Any, folder: Path | None) -> Config:
     return config.load_config(beside if beside is not None and beside.is_file() else given)
 
 
-def _by_full_name(base: Config, values: Mapping[str, Any]) -> dict[str, Any]:
+def _by_full_name(base: Config, values: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Raises `UserError` for what is no setting, and for the same setting twice."""
     known, found = config.fields(base), dict[str, Any]()
     for name, value in values.items():
         field = config.find(name, known)
         full = f"{field.section}.{field.name}"
         if full in found:
-            raise UserError(f"{full} is set twice in [fixed]")
+            raise UserError(f"{full} is set twice in {where}")
         found[full] = value
     return found
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +20,6 @@ from arm5dof.sweeps.local import ATTEMPTS, Jobs, LocalExecutor
 from arm5dof.sweeps.results import Row
 from arm5dof.sweeps.spec import Member, Spec
 from arm5dof.sweeps.worker import DONE, FAILED, Ending, Job, ended, finish
-from arm5dof.training import config
 from arm5dof.training.run import Reporter, Silent, free_folder
 
 WRITE_EVERY_S = 20.0
@@ -181,6 +179,7 @@ def _drive(current: Sweep, runner: Executor, jobs: Jobs, reporter: Reporter) -> 
     """Run all jobs, and keep the table."""
     folder = current.members_folder
     rows: dict[str, list[Row]] = {}
+    known = {member.name: member for member in current.members}
     best: tuple[float, str] | None = None
     sign = -1 if current.headline.metric.higher_is_better else 1
     written = time.monotonic()
@@ -206,14 +205,16 @@ def _drive(current: Sweep, runner: Executor, jobs: Jobs, reporter: Reporter) -> 
             note += f", {unwell} failed or diverged"
         reporter.update(len(rows), note)
 
-    for member in current.members:
+    for member in known.values():
         if ended(folder, member.name):
             take(member)
     show()
     for job in runner.run(jobs, lost):
         jobs.ended(job)
-        for name, text in job.members:
-            take(current.spec.as_member(name, config.build(tomllib.loads(text))))
+        for name, _ in job.members:
+            if name not in known:  # Of a trial that is new.
+                known |= {member.name: member for member in current.members}
+            take(known[name])
             ending = ended(folder, name)
             if ending and ending.status != DONE:
                 reporter.say(f"{name} {ending.status}: {ending.reason}")

@@ -100,6 +100,10 @@ def test_ranges_have_both_ends():
         ({"axes": {"noise": [0.1]}, "search": {"method": "grid"}}, "search.method = 'grid'"),
         ({"axes": {"noise": [0.1]}, "search": {}}, "a search is random"),
         ({"axes": {"seed": {"count": 400}, "noise": {"range": [0, 1, 0.001]}}}, "members are more than"),
+        ({"variants": {"a": {"noise": 0}}, "axes": {"noise": [0.1]}}, "it is an axis, and set by variant 'a'"),
+        ({"variants": {"a": {"nose": 0}}}, "did you mean 'noise'?"),
+        ({"variants": {"a": 3}}, "it should be a table [variants]"),
+        ({"variants": {"a": {"noise": -1}}}, "ddpg.noise = -1"),
         ({"base": "nowhere.toml", "axes": {"noise": [0.1]}}, "no experiment 'nowhere.toml'"),
         ({"base": 3, "axes": {"noise": [0.1]}}, "base = 3"),
     ],
@@ -117,7 +121,7 @@ def test_a_sweep_is_no_experiment_nor_the_other_way_round(tmp_path):
 
 
 def test_every_sweep_that_ships_can_be_read():
-    names = [n for n in files.shipped("experiments", ".toml") if "\n[axes]" in files.find("experiments", n).read_text()]
+    names = [name for name in files.shipped("experiments", ".toml") if name not in config.shipped_experiments()]
     assert "sweep_smoke.toml" in names
     assert all(spec.read(name).members or spec.read(name).search for name in names)
 
@@ -137,3 +141,16 @@ def test_a_base_may_be_a_configuration_or_its_sections():
     sections = tomllib.loads(config.dumps(BASE))
     assert spec.parse({"base": sections, "axes": axes}).same_as(parse(axes))
     assert spec.parse({"base": "kinematic.toml", "axes": axes}).members == parse(axes).members
+
+
+def test_variants_are_an_axis_of_named_settings():
+    variants = {"the recipe": {}, "no noise": {"noise": 0, "final_noise": 0}, "one head": {"heads": 1}}
+    made = parse({"seed": {"count": 2}}, variants=variants)
+    assert [(m.settings["variant"], m.settings["train.seed"]) for m in made.members] == [
+        (name, seed) for name in variants for seed in (0, 1)
+    ]
+    found = {m.settings["variant"]: m.config.ddpg for m in made.members}
+    assert found["the recipe"] == BASE.ddpg and found["no noise"].noise == 0 and found["one head"].heads == 1
+    kept = spec.parse(tomllib.loads(made.dumps()))
+    assert kept.same_as(made) and kept.members == made.members
+    assert not made.same_as(parse({"seed": {"count": 2}}, variants=dict(reversed(variants.items()))))
