@@ -36,7 +36,7 @@ class LocalExecutor:
     """Runs jobs in worker processes.
 
     Args:
-        workers: How many; None for one a core, or one a GPU.
+        workers: How many; None for one a core, or one a GPU, of which each has one at most.
         gpus: How many GPUs there are to share out; 0 shares out the cores.
     """
 
@@ -44,7 +44,7 @@ class LocalExecutor:
     """A file descriptor that every worker holds open too, so that a lock on it lasts as long as they do."""
 
     def __init__(self, workers: int | None = None, gpus: int = 0) -> None:
-        self.workers = workers or gpus or xla.cores()
+        self.workers = min(workers or gpus, gpus) if gpus else workers or xla.cores()
         self.gpus = gpus
 
     def run(self, jobs: Jobs, lost: Callable[[Job], None]) -> Iterator[Job]:
@@ -109,7 +109,8 @@ class LocalExecutor:
         }
         cores: Sequence[int] = ()
         if self.gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = str(number % self.gpus)
+            visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+            environment["CUDA_VISIBLE_DEVICES"] = visible.split(",")[number] if visible else str(number)
             environment.pop("XLA_PYTHON_CLIENT_PREALLOCATE", None)
         elif hasattr(os, "sched_setaffinity"):
             own = sorted(os.sched_getaffinity(0))

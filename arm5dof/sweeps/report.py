@@ -22,7 +22,8 @@ def write(current: Sweep, say: Callable[[str], object]) -> None:
         say: Told what could not be written.
     """
     rows = current.table
-    results.write(current.folder, rows)
+    if not results.write(current.folder, rows):
+        say("no results.parquet: it takes pip install 'arm5dof[sweep]'")
     lines = current.summary(rows)
     found = summary.table(f"Sweep {current.folder.name}", lines, current.headline)
     files.write_text(current.folder / "summary.md", f"# {found.title}\n\n{found.markdown()}\n")

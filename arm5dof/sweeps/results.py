@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
@@ -81,21 +80,24 @@ def columns(rows: Iterable[Row]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
-def write(folder: Path, rows: list[Row]) -> None:
-    """Write `results.csv`, and `results.parquet` where pyarrow is installed; each is replaced whole."""
+def write(folder: Path, rows: list[Row]) -> bool:
+    """Write `results.csv`, and `results.parquet` where pyarrow is installed; each is replaced whole. Returns whether it
+    is."""
     names = columns(rows)
     text = io.StringIO()
     writer = csv.DictWriter(text, names)
     writer.writeheader()
     writer.writerows(rows)
     files.write_text(folder / "results.csv", text.getvalue())
-    with contextlib.suppress(ImportError):
+    try:
         import pyarrow
         from pyarrow import parquet
-
-        table = pyarrow.table({name: _column([row.get(name) for row in rows]) for name in names})
-        with files.replacing(folder / "results.parquet") as temporary:
-            parquet.write_table(table, temporary)
+    except ImportError:
+        return False
+    table = pyarrow.table({name: _column([row.get(name) for row in rows]) for name in names})
+    with files.replacing(folder / "results.parquet") as temporary:
+        parquet.write_table(table, temporary)
+    return True
 
 
 def _column(values: list[Any]) -> list[Any]:

@@ -174,7 +174,7 @@ def parse(values: Mapping[str, Any], folder: Path | None = None) -> Spec:
     if "base" not in values or not (given or stated):
         raise UserError('a sweep names its base experiment, base = "NAME.toml", and has [axes] with one at least')
     sample_seed = values.get("sample_seed")
-    if sample_seed is not None and (not isinstance(sample_seed, int) or sample_seed < 0):
+    if sample_seed is not None and (type(sample_seed) is not int or sample_seed < 0):
         raise UserError(f"sample_seed = {sample_seed!r}: it should be a whole number, 0 or more")
     base = _base(values["base"], folder)
     named = _by_full_name(base, fixed, "[fixed]")

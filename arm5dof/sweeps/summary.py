@@ -97,7 +97,7 @@ def summarise(rows: Iterable[Mapping[str, Any]], higher: bool, names: Iterable[s
         found.setdefault(tuple(row[name] for name in names), []).append(row)
     lines = []
     for values, alike in found.items():
-        measured = (row for row in alike if row["status"] == DONE and row.get("headline") is not None)
+        measured = (row for row in alike if row["status"] == DONE and _is_number(row.get("headline")))
         done = sorted(measured, key=lambda row: row["headline"], reverse=higher)
         of = estimate([row["headline"] for row in done], seed)
         settings = dict(zip(names, values, strict=True))
@@ -106,11 +106,15 @@ def summarise(rows: Iterable[Mapping[str, Any]], higher: bool, names: Iterable[s
     return sorted(lines, key=lambda line: (line.lost > 0, not line.seeds, sign * line.headline.value))
 
 
+def _is_number(value: Any) -> bool:
+    return value is not None and math.isfinite(value)
+
+
 def curve(rows: Iterable[Mapping[str, Any]], seed: int = 0) -> tuple[list[int], list[Estimate]]:
     """How the headline went with episodes, over the members that these rows are of."""
     found: dict[int, list[float]] = {}
     for row in rows:
-        if row.get("headline") is not None:
+        if _is_number(row.get("headline")):
             found.setdefault(int(row["episodes"]), []).append(float(row["headline"]))
     episodes = sorted(found)
     return episodes, [estimate(found[n], seed) for n in episodes]

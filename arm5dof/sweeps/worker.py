@@ -8,6 +8,7 @@ when whoever started it does.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -15,6 +16,7 @@ import queue
 import shutil
 import sys
 import threading
+import time
 import tomllib
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import asdict, dataclass
@@ -33,6 +35,7 @@ from arm5dof.training.config import Config
 from arm5dof.training.run import Run, Silent
 from arm5dof.training.trainer import Trainer
 
+PATIENCE_S = 20.0
 DONE, DIVERGED, FAILED, PRUNED = "done", "diverged", "failed", "pruned"
 
 
@@ -148,7 +151,17 @@ class Worker:
                 shutil.rmtree(leftover, ignore_errors=True)
             made = self._program(settings).again(settings)
             opened = Run.create(settings, folder, made.env)
+        _wait_until_free(opened)
         run.resume(opened, _Stopping(opened, stop) if stop else None, made)
+
+
+def _wait_until_free(opened: Run) -> None:
+    """A worker whose sweep was killed holds its run a little longer."""
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        with contextlib.suppress(UserError), opened.locked():
+            return
+        time.sleep(0.1)
 
 
 class _Stopping(Silent):
