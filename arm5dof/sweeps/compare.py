@@ -77,8 +77,8 @@ def compare(*folders: str | Path) -> Comparison:
     >>> folder = tempfile.TemporaryDirectory()
     >>> budget = {"episodes": 2, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "updates_per_step": 1}
     >>> config = load_config("kinematic.toml", targets=100, refinements=1, **budget)  # Seconds: far from enough.
-    >>> runs = [train(config, f"{folder.name}/{name}").folder for name in ("one", "two")]
-    >>> compare(*runs).table.header
+    >>> found = compare(train(config, f"{folder.name}/one").folder)  # Or several, and sweeps.
+    >>> found.table.header
     ('of', 'seeds', 'episodes', 'updates', 'seconds', 'one_shot, mm, lower is better')
     """
     if not folders:

@@ -14,6 +14,7 @@ from helpers.sweeps import environment, toy
 
 from arm5dof import Sweep, load_config, load_policy
 from arm5dof.cli import main as cli
+from arm5dof.sweeps import spec
 
 
 def run(*arguments):
@@ -34,17 +35,10 @@ def fails(capsys):
     return check
 
 
-@pytest.fixture(scope="module")
-def smoke(tmp_path_factory):
-    out = tmp_path_factory.mktemp("sweeps") / "smoke"
-    started = time.monotonic()
+def test_the_smoke_sweep_ends_in_two_minutes_with_everything(tmp_path, capsys):
+    out, started = tmp_path / "smoke", time.monotonic()
     assert run("sweep", "sweep_smoke.toml", "--out", out) == 0
-    return out, time.monotonic() - started
-
-
-def test_the_smoke_sweep_ends_in_two_minutes_with_everything(smoke, capsys):
-    out, seconds = smoke
-    assert seconds < 120
+    assert time.monotonic() - started < 120
     found = Sweep.open(out)
     assert [(r["status"], r["episodes"]) for r in found.table] == [("done", 10), ("done", 20)] * 4
     for name in ("results.csv", "results.parquet", "summary.md", "learning.png", "axes.png"):
@@ -53,9 +47,9 @@ def test_the_smoke_sweep_ends_in_two_minutes_with_everything(smoke, capsys):
     target = [0.15, 0.05, 0.12]  # The file has its robot to six digits.
     answers = [p.solve(target, corrections=2) for p in (load_policy(out / "best.zip"), found.best.policy())]
     assert np.allclose(answers[0].q, answers[1].q, atol=1e-3)
-    assert run("compare", out, out / "members" / "m0001", "--figure", out.parent / "side.png") == 0
+    assert run("compare", out, out / "members" / "m0001", "--figure", tmp_path / "side.png") == 0
     printed = capsys.readouterr().out
-    assert "actor_lr 0.005" in printed and "m0001" in printed and (out.parent / "side.png").stat().st_size > 0
+    assert "actor_lr 0.005" in printed and "m0001" in printed and (tmp_path / "side.png").stat().st_size > 0
 
 
 def test_help_teaches(capsys):
@@ -70,8 +64,8 @@ def test_help_teaches(capsys):
         assert all(word in shown for word in words)
 
 
-def test_bad_input_is_one_line(smoke, fails, tmp_path):
-    out, _ = smoke
+def test_bad_input_is_one_line(fails, tmp_path):
+    out = Sweep.create(spec.read("sweep_smoke.toml"), tmp_path / "begun").folder
     toy(tmp_path)
 
     def sweep(axes, *options):
