@@ -18,7 +18,9 @@ _HOMES = {
     "Grasper": "arm5dof.grasp.grasper",
     "Policy": "arm5dof.training.policy",
     "Run": "arm5dof.training.run",
+    "Sweep": "arm5dof.sweeps.folder",
     "Task": "arm5dof.envs",
+    "compare": "arm5dof.sweeps.compare",
     "load_arm": "arm5dof.arm",
     "load_config": "arm5dof.training.config",
     "load_detector": "arm5dof.vision.detectors.loading",
@@ -26,6 +28,7 @@ _HOMES = {
     "locate": "arm5dof.vision.localization",
     "make_env": "arm5dof.training.config",
     "resume": "arm5dof.training.run",
+    "sweep": "arm5dof.sweeps.sweep",
     "train": "arm5dof.training.run",
 }
 
@@ -36,6 +39,9 @@ if TYPE_CHECKING:
     from arm5dof.arm import load_arm as load_arm
     from arm5dof.envs import Task as Task
     from arm5dof.grasp.grasper import Grasper as Grasper
+    from arm5dof.sweeps.compare import compare as compare
+    from arm5dof.sweeps.folder import Sweep as Sweep
+    from arm5dof.sweeps.sweep import sweep as sweep
     from arm5dof.training.config import Config as Config
     from arm5dof.training.config import load_config as load_config
     from arm5dof.training.config import make_env as make_env

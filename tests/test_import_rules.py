@@ -11,6 +11,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LINT = "from importlinter.cli import lint_imports_command as lint; lint(['--no-logo', '--no-cache'])"
 
+NO_TASK = "Agent, training, sweeps and command line know no concrete task"
+
 VIOLATIONS = [
     ("Packages import only those below them", "envs/metrics.py", "import arm5dof.training.run"),
     ("Packages import only those below them", "envs/metrics.py", "from arm5dof import Run"),
@@ -20,9 +22,16 @@ VIOLATIONS = [
     ("Packages import only those below them", "new_package.py", "import jax"),
     ("Vision knows no environments and no agents", "vision/camera.py", "import arm5dof.envs.vector"),
     ("Vision knows no environments and no agents", "vision/camera.py", "import arm5dof.ddpg.replay"),
-    ("Agent, training and command line know no concrete task", "ddpg/agent.py", "import arm5dof.envs.reach"),
-    ("Agent, training and command line know no concrete task", "training/run.py", "import arm5dof.envs.reach_pose"),
-    ("Agent, training and command line know no concrete task", "cli/solve.py", "import arm5dof.envs.arm_goal"),
+    (NO_TASK, "ddpg/agent.py", "import arm5dof.envs.reach"),
+    (
+        "Agent, training, sweeps and command line know no concrete task",
+        "training/run.py",
+        "import arm5dof.envs.reach_pose",
+    ),
+    (NO_TASK, "cli/solve.py", "import arm5dof.envs.arm_goal"),
+    (NO_TASK, "sweeps/spec.py", "import arm5dof.envs.reach"),
+    ("Packages import only those below them", "training/run.py", "import arm5dof.sweeps.spec"),
+    ("Sweeps know no vision", "sweeps/spec.py", "import arm5dof.vision.camera"),
     ("Nobody imports the command line", "__init__.py", "import arm5dof.cli.parser"),
     ("Only the command line parses arguments", "training/run.py", "import argparse"),
     ("Only the command line opens progress bars", "training/run.py", "import arm5dof.runtime.progress"),

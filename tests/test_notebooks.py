@@ -12,6 +12,7 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 SAID = {
     "01_quickstart": ("corrections=10: median 0.0", "mm at most", "degrees off"),
     "02_environment": ("servo: observations", "truncated 1, new goal: True", "carts that stop within 5 cm: 100 %"),
+    "03_sweep": ("16 rows of", "best: m00", "nothing is done twice: True"),
     "04_vision": ("views, RMS 0.0", "mm from where it is", "off by"),
     "05_grasp": ("stage='done'", "is seen"),
 }

@@ -1,4 +1,4 @@
-"""The command line: `arm5dof train | eval | solve | export | grasp | vision`.
+"""The command line: `arm5dof train | eval | solve | export | sweep | compare | grasp | vision`.
 
 Declaring commands must be quick, so whatever takes JAX, MuJoCo or OpenCV is imported where it is used.
 """
@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Sequence
 
 from arm5dof import __version__
-from arm5dof.cli import evaluate, export, grasp, solve, train, vision
+from arm5dof.cli import compare, evaluate, export, grasp, solve, sweep, train, vision
 from arm5dof.cli.parser import Parser
 from arm5dof.errors import UserError
 
@@ -48,6 +48,8 @@ def make_parser() -> Parser:
     evaluate.declare(commands)
     solve.declare(commands)
     export.declare(commands)
+    sweep.declare(commands)
+    compare.declare(commands)
     grasp.declare(commands)
     vision.declare(
         commands.add_parser("vision", help="cameras: calibrate, pose, detect, locate", description="What the arm sees.")

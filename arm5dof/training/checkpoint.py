@@ -63,6 +63,10 @@ class Checkpoints:
         with _as_user_error(f"cannot open the checkpoints in {folder}"):
             self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
 
+    def close(self) -> None:
+        """Let go of orbax's threads: a process may train thousands of runs."""
+        self._manager.close()
+
     @property
     def latest(self) -> int | None:
         """Steps at the newest complete checkpoint, or None."""

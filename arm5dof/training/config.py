@@ -109,9 +109,12 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     """
     path = files.find("experiments", experiment)
     if path is None:
-        names = ", ".join(files.shipped("experiments", ".toml"))
+        names = ", ".join(shipped_experiments())
         raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
-    return override(build(_read(path), str(path), path.parent, fill=True), overrides)
+    values = _read(path)
+    if "axes" in values or "variants" in values:
+        raise UserError(f"{path} is a sweep, not an experiment: run it with arm5dof sweep {path}")
+    return override(build(values, str(path), path.parent, fill=True), overrides)
 
 
 def override(config: Config, values: Mapping[str, Any]) -> Config:
@@ -195,9 +198,14 @@ def task_class(task: str, folder: Path | None = None) -> type[Task]:
     return found
 
 
+def shipped_experiments() -> list[str]:
+    """Names of the experiments that ship. Sweeps lie beside them, and their names say so."""
+    return [name for name in files.shipped("experiments", ".toml") if not name.startswith("sweep_")]
+
+
 def shipped_tasks() -> list[str]:
     """Names of the tasks that ship: those with a module and a TOML file of the same name."""
-    names = [name.removesuffix(".toml") for name in files.shipped("experiments", ".toml")]
+    names = [name.removesuffix(".toml") for name in shipped_experiments()]
     return [name for name in names if importlib.util.find_spec(f"arm5dof.envs.{name}")]
 
 

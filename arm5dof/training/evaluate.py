@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any
 
@@ -49,7 +49,7 @@ def evaluate(
         By name of the task's metrics what was measured, summarised as the metric says; and `means`, the mean of every
         array measured, in SI units.
     """
-    key = jax.random.fold_in(jax.random.key(seed), 0xE7A1)
+    key = _stream(seed)
     chunk = min(CHUNK, targets)
     parts: dict[str, list[np.ndarray]] = {}
     for done in range(0, targets, chunk):
@@ -58,10 +58,39 @@ def evaluate(
             parts.setdefault(name, []).append(np.asarray(values)[: targets - done])
         if progress:
             progress(min(done + chunk, targets))
+    return _summarised(policy.env, {name: np.concatenate(values) for name, values in parts.items()})
+
+
+def evaluate_together(policies: Policy, targets: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Measure several policies of one task in one program, each on the targets that `evaluate` draws from its seed.
+
+    Args:
+        policies: A policy whose leaves have a leading axis, one entry for each.
+        targets: How many unseen targets, or episodes, for each.
+        seeds: Of the targets of each.
+
+    Returns:
+        What `evaluate` returns, for each.
+    """
+    keys = jax.numpy.stack([_stream(seed) for seed in seeds])
+    chunk = min(CHUNK, targets)
+    parts: dict[str, list[np.ndarray]] = {}
+    for done in range(0, targets, chunk):
+        folded = jax.vmap(jax.random.fold_in, (0, None))(keys, done)
+        for name, values in _measure_together(policies.env, policies, folded, chunk).items():
+            parts.setdefault(name, []).append(np.asarray(values)[:, : targets - done])
+    found = {name: np.concatenate(values, axis=1) for name, values in parts.items()}
+    return [_summarised(policies.env, {k: v[i] for k, v in found.items()}) for i in range(len(seeds))]
+
+
+def _stream(seed: int) -> jax.Array:
+    """Random numbers that training never touches."""
+    return jax.random.fold_in(jax.random.key(seed), 0xE7A1)
+
+
+def _summarised(env: Task, found: Mapping[str, np.ndarray]) -> dict[str, Any]:
     # JAX returns dictionaries sorted; people read them in the task's order.
-    order = [name for name in policy.env.metrics if name in parts]
-    found = {name: np.concatenate(parts[name]) for name in parts}
-    results: dict[str, Any] = {name: policy.env.metrics[name].summary(found[name]) for name in order}
+    results: dict[str, Any] = {name: m.summary(found[name]) for name, m in env.metrics.items() if name in found}
     return {**results, "means": {name: float(values.mean()) for name, values in found.items()}}
 
 
@@ -78,3 +107,8 @@ def tables(metrics: Mapping[str, Metric], results: Mapping[str, Any]) -> str:
 @partial(jax.jit, static_argnames=("env", "n"))
 def _measure(env: Task, policy: Policy, key: jax.Array, n: int) -> dict[str, jax.Array]:
     return env.evaluate(policy, key, n)
+
+
+@partial(jax.jit, static_argnames=("env", "n"))
+def _measure_together(env: Task, policies: Policy, keys: jax.Array, n: int) -> dict[str, jax.Array]:
+    return jax.vmap(lambda policy, key: env.evaluate(policy, key, n))(policies, keys)

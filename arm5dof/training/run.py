@@ -12,7 +12,7 @@ import json
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import metadata
@@ -309,8 +309,8 @@ def resume(
     arm5dof.errors.UserError: no logger 'tensorbord': did you mean 'tensorboard'?
     """
     ready = make_loggers(loggers)
-    with run.locked():
-        checkpoints, reporter = run._checkpoints(), reporter or Silent()
+    with run.locked(), closing(run._checkpoints()) as checkpoints:
+        reporter = reporter or Silent()
         # What no longer fits is said before a trainer is made of it.
         if changed := checkpoints.check():
             told = ", ".join(f"{name} {before} -> {now}" for name, (before, now) in changed.items())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple, Protocol
@@ -20,6 +21,9 @@ from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
 
 Count = Annotated[int, Ge(1)]
+
+WATCHED = 0x9B0E
+"""The stream of random numbers on which a task is watched."""
 
 
 @settings
@@ -77,6 +81,16 @@ class Trainer:
         self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
         self._init = jax.jit(self.agent.init, compiler_options=xla.effort(0))
 
+    def again(self, config: Settings) -> Trainer:
+        """The same program for another configuration that differs by the agent's numbers and the seed alone, not
+        begun: nothing is traced or compiled anew."""
+        self.check()
+        _ = self._epoch
+        other = copy.copy(self)
+        other.config = config
+        other.__dict__.pop("state", None)
+        return other
+
     @property
     def replay_bytes(self) -> int:
         """Memory that the replay buffer takes on the device."""
@@ -96,8 +110,9 @@ class Trainer:
                 f"replay_capacity = {self.config.ddpg.replay_capacity} takes {needed / 1e9:.1f} GB and "
                 f"{free / 1e9:.1f} GB are free: choose a smaller one"
             )
-        if self._program.kept is None:  # Else it has been simulated before.
+        if not self._simulated:
             self.env.check()
+            self._simulated = True
 
     def start(self) -> None:
         """Begin a new run."""
@@ -137,6 +152,11 @@ class Trainer:
         return jax.tree.leaves(self.config.ddpg), jax.tree.leaves(state)
 
     @cached_property
+    def _simulated(self) -> bool:
+        """Whether the environment has been simulated before."""
+        return self._program.kept is not None
+
+    @cached_property
     def _epoch(self) -> Future[jax.stages.Compiled]:
         """Compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
         epoch = self._program.jit(donate_argnums=1, compiler_options=xla.effort(2))
@@ -145,7 +165,7 @@ class Trainer:
     def _watch(self) -> dict[str, jax.Array]:
         """What the task has to watch, on random numbers that neither training nor evaluation uses."""
         policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)
-        return _watched(self.env, policy, jax.random.fold_in(jax.random.key(self.config.train.seed), 0x9B0E))
+        return _watched(self.env, policy, jax.random.fold_in(jax.random.key(self.config.train.seed), WATCHED))
 
     @property
     def counters(self) -> Counters:

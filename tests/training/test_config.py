@@ -12,11 +12,10 @@ from arm5dof.ddpg import DDPGConfig
 from arm5dof.envs.reach import ReachConfig
 from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 from arm5dof.training import config
 
 
-@pytest.mark.parametrize("name", files.shipped("experiments", ".toml"))
+@pytest.mark.parametrize("name", config.shipped_experiments())
 def test_shipped_experiments_survive_a_round_trip(name, tmp_path):
     loaded = config.load_config(name)
     (tmp_path / "again.toml").write_text(config.dumps(loaded))

@@ -1,0 +1,190 @@
+"""Members of one program shape side by side in one program: `jax.vmap` over seeds and the agent's numbers. It pays on a
+GPU; on a CPU a batch of small matrix products is slower than one after the other. What a member leaves behind is a run
+folder like any other; its numbers are those of training it alone within the reordering of sums."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from arm5dof.ddpg import Training
+from arm5dof.runtime import files, xla
+from arm5dof.sweeps.worker import DIVERGED, DONE, Ending, finish, not_finite
+from arm5dof.training import config, report, trainer
+from arm5dof.training.checkpoint import Checkpoints
+from arm5dof.training.config import Config
+from arm5dof.training.evaluate import evaluate_together
+from arm5dof.training.policy import Policy
+from arm5dof.training.run import Run
+from arm5dof.training.trainer import Counters, Trainer
+
+
+class Population:
+    """Trainings of one program shape in step, one entry of a leading axis each.
+
+    Args:
+        program: The training program of any of them.
+        settings: Their configurations, which differ by the agent's numbers and the seed alone.
+    """
+
+    state: Training
+
+    def __init__(self, program: Trainer, settings: Sequence[Config]) -> None:
+        self.program, self.settings = program, settings
+        self._numbers = jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *(s.ddpg for s in settings))
+        self._keys = jnp.stack([jax.random.key(s.train.seed) for s in settings])
+        self._init, self._epoch, self._watched = _programs(program)
+
+    def start(self) -> None:
+        """Begin new trainings."""
+        self.state = self._init(self._numbers, self._keys)
+
+    def restore(self, states: Sequence[Training]) -> None:
+        """Go on from states that all have taken the same steps."""
+        self.state = jax.tree.map(lambda *x: jnp.stack(x), *states)
+
+    def advance(self) -> list[dict[str, float]]:
+        """One epoch. Returns the metrics of each; see `Trainer.advance`."""
+        self.state, metrics = self._epoch(self._numbers, self.state)
+        found = jax.device_get({**metrics, **self._watched(self.policies(), self._keys)})
+        return [{name: float(values[i]) for name, values in found.items()} for i in range(len(self.settings))]
+
+    def policies(self) -> Policy:
+        """All policies, with a leading axis."""
+        return Policy(self.program.env, self.program.agent, self._numbers, self.state.networks)
+
+    def evaluate(self, targets: int) -> list[dict[str, Any]]:
+        """Measure each policy."""
+        return evaluate_together(self.policies(), targets, [s.train.seed for s in self.settings])
+
+    def member(self, number: int) -> Training:
+        """The state of one training."""
+        return jax.tree.map(lambda x: x[number], self.state)
+
+    @property
+    def counters(self) -> Counters:
+        """How far each is."""
+        steps, updates = int(self.state.steps[0]), int(self.state.updates[0])
+        env_steps = steps * self.settings[0].train.num_envs
+        return Counters(steps, env_steps // self.program.env.episode_length, env_steps, updates)
+
+
+@functools.lru_cache(1)
+def _programs(program: Trainer) -> tuple[Any, Any, Any]:
+    """`init`, `epoch` and `watch` of many, kept from chunk to chunk."""
+    steps, agent, env = program.config.train.epoch_steps, program.agent, program.env
+
+    def watched(policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
+        return env.watch(policy, jax.random.fold_in(key, trainer.WATCHED))
+
+    def epoch(numbers: Any, state: Training) -> tuple[Training, dict[str, jax.Array]]:
+        return agent.epoch(numbers, state, steps)
+
+    return (
+        jax.jit(jax.vmap(agent.init), compiler_options=xla.effort(0)),
+        jax.jit(jax.vmap(epoch), donate_argnums=1, compiler_options=xla.effort(2)),
+        jax.jit(jax.vmap(watched)),
+    )
+
+
+class _Folder(NamedTuple):
+    """A member and what its run folder gets."""
+
+    name: str
+    run: Run
+    checkpoints: Checkpoints
+    rows: list[dict[str, Any]]
+    evaluations: list[dict[str, Any]]
+
+    def write_rows(self) -> None:
+        path = self.run.folder / "metrics.csv"
+        with files.replacing(path) as temporary, open(temporary, "w", newline="") as handle:
+            writer = csv.DictWriter(handle, self.rows[0])
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def write_evaluations(self) -> None:
+        files.write_text(self.run.folder / "evaluations.json", json.dumps(self.evaluations, indent=1) + "\n")
+
+
+def train_together(program: Trainer, folder: Path, members: Sequence[tuple[str, Config]]) -> None:
+    """Train members to their end, from their newest checkpoints if they have some, and leave how each ended.
+
+    Args:
+        program: The training program of any of them.
+        folder: Where their run folders are, or go.
+        members: Names and configurations of one program shape.
+
+    Raises:
+        UserError: A folder is of another configuration or damaged, or trained by another process.
+    """
+    with ExitStack() as stack:
+        at: dict[int | None, list[_Folder]] = {}
+        for name, settings in members:
+            place = folder / name
+            run = Run.open(place) if place.exists() else Run.create(settings, place, program.env)
+            stack.enter_context(run.locked())
+            kept = Checkpoints(place / "checkpoints", config.fixed(settings), config.may_change(settings))
+            stack.callback(kept.close)
+            kept.check()
+            at.setdefault(kept.latest, []).append(_Folder(name, run, kept, [], []))
+        for steps, alike in at.items():  # A sweep that was killed while it wrote checkpoints left some behind others.
+            _train(Population(program, [m.run.config for m in alike]), folder, alike, steps)
+
+
+def _train(population: Population, folder: Path, members: list[_Folder], steps: int | None) -> None:
+    program, settings = population.program, population.settings[0]
+    budget, length = settings.train, program.env.episode_length
+    if steps is None:
+        population.start()
+    else:
+        population.restore([member.checkpoints.restore(program.like) for member in members])
+        for member in members:
+            columns = member.run.metrics
+            rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+            member.rows.extend(
+                {k: int(v) if k in Counters._fields else v for k, v in row.items()}
+                for row in rows
+                if row["steps"] <= steps
+            )
+            member.evaluations.extend(e for e in member.run.evaluations if e["steps"] <= steps)
+    before = max((float(member.rows[-1]["seconds"]) for member in members if member.rows), default=0.0)
+    started = time.monotonic()
+    alive = dict(enumerate(members))
+    while alive:
+        at = population.counters
+        finished = at.steps >= program.total_steps
+        due = at.steps > 0 and at.steps % (budget.evaluate_every // budget.num_envs * length) == 0
+        lacking = [n for n, m in alive.items() if all(e["steps"] != at.steps for e in m.evaluations)]
+        if (due or finished) and lacking:
+            protocol = settings.evaluate
+            targets = protocol.targets if finished else protocol.interim_targets
+            found = population.evaluate(targets)
+            for number in lacking:
+                alive[number].evaluations.append({**at._asdict(), "targets": targets, **found[number]})
+                alive[number].write_evaluations()
+        if finished:
+            break
+        metrics = population.advance()
+        at, seconds = population.counters, before + time.monotonic() - started
+        for number, member in list(alive.items()):
+            if lost := not_finite(metrics[number]):
+                finish(folder, member.name, Ending(DIVERGED, f"{lost} by episode {at.episodes}"))
+                del alive[number]
+                continue
+            member.rows.append(trainer.row(at, seconds, metrics[number]))
+            if at.steps % (budget.checkpoint_every // budget.num_envs * length) == 0 or at.steps >= program.total_steps:
+                member.write_rows()
+                member.checkpoints.save(population.member(number))
+    for member in alive.values():
+        report.write(member.run.folder, member.run.config, program.env, member.rows, member.evaluations)
+        finish(folder, member.name, Ending(DONE))
