@@ -55,6 +55,9 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.add_argument("--executor", choices=("local", "ray"), default="local", help="who trains; default: this machine")
     p.add_argument("--workers", type=positive, metavar="N", help="members at once; default: one a core, or a GPU")
     p.add_argument("--address", help="of a Ray cluster; default: one that is at hand, or a local one")
+    p.add_argument(
+        "--log", metavar="NAME", default="", help="curves elsewhere too: tensorboard, wandb, or both by a comma"
+    )
     p.set_defaults(run=run)
 
 
@@ -88,6 +91,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> int | None:
                 address=args.address,
                 resume=args.resume,
                 reporter=bar,
+                loggers=args.log.split(",") if args.log else (),
             )
     except KeyboardInterrupt:
         named = f"{args.sweep} " if args.sweep else ""

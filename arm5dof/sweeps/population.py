@@ -23,6 +23,7 @@ from arm5dof.training import config, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import Config
 from arm5dof.training.evaluate import evaluate_together
+from arm5dof.training.loggers import Log, Logger, logging, make_loggers
 from arm5dof.training.policy import Policy
 from arm5dof.training.run import Run
 from arm5dof.training.trainer import Counters, Trainer
@@ -104,6 +105,7 @@ class _Folder(NamedTuple):
     checkpoints: Checkpoints
     rows: list[dict[str, Any]]
     evaluations: list[dict[str, Any]]
+    loggers: list[Logger]
 
     def write_rows(self) -> None:
         path = self.run.folder / "metrics.csv"
@@ -116,13 +118,16 @@ class _Folder(NamedTuple):
         files.write_text(self.run.folder / "evaluations.json", json.dumps(self.evaluations, indent=1) + "\n")
 
 
-def train_together(program: Trainer, folder: Path, members: Sequence[tuple[str, Config]]) -> None:
+def train_together(
+    program: Trainer, folder: Path, members: Sequence[tuple[str, Config]], loggers: Sequence[str] = ()
+) -> None:
     """Train members to their end, from their newest checkpoints if they have some, and leave how each ended.
 
     Args:
         program: The training program of any of them.
         folder: Where their run folders are, or go.
         members: Names and configurations of one program shape.
+        loggers: Where the curves of each go besides its folder.
 
     Raises:
         UserError: A folder is of another configuration or damaged, or trained by another process.
@@ -136,14 +141,13 @@ def train_together(program: Trainer, folder: Path, members: Sequence[tuple[str, 
             kept = Checkpoints(place / "checkpoints", config.fixed(settings), config.may_change(settings))
             stack.callback(kept.close)
             kept.check()
-            at.setdefault(kept.latest, []).append(_Folder(name, run, kept, [], []))
+            at.setdefault(kept.latest, []).append(_Folder(name, run, kept, [], [], make_loggers(loggers)))
         for steps, alike in at.items():  # A sweep that was killed while it wrote checkpoints left some behind others.
             _train(Population(program, [m.run.config for m in alike]), folder, alike, steps)
 
 
 def _train(population: Population, folder: Path, members: list[_Folder], steps: int | None) -> None:
-    program, settings = population.program, population.settings[0]
-    budget, length = settings.train, program.env.episode_length
+    program = population.program
     if steps is None:
         population.start()
     else:
@@ -160,6 +164,20 @@ def _train(population: Population, folder: Path, members: list[_Folder], steps: 
     before = max((float(member.rows[-1]["seconds"]) for member in members if member.rows), default=0.0)
     started = time.monotonic()
     alive = dict(enumerate(members))
+    with ExitStack() as stack:
+        logs = [stack.enter_context(logging(m.run, m.loggers, m.rows, m.evaluations)) for m in members]
+        _train_on(population, folder, alive, logs, before - started)
+    for member in alive.values():
+        report.write(member.run.folder, member.run.config, program.env, member.rows, member.evaluations)
+        finish(folder, member.name, Ending(DONE))
+
+
+def _train_on(
+    population: Population, folder: Path, alive: dict[int, _Folder], logs: Sequence[Log], offset: float
+) -> None:
+    """Train to the end, or until nobody is alive. `offset` makes seconds of training of the clock."""
+    program, settings = population.program, population.settings[0]
+    budget, length = settings.train, program.env.episode_length
     while alive:
         at = population.counters
         finished = at.steps >= program.total_steps
@@ -172,19 +190,18 @@ def _train(population: Population, folder: Path, members: list[_Folder], steps: 
             for number in lacking:
                 alive[number].evaluations.append({**at._asdict(), "targets": targets, **found[number]})
                 alive[number].write_evaluations()
+                logs[number].evaluation(alive[number].evaluations[-1])
         if finished:
             break
         metrics = population.advance()
-        at, seconds = population.counters, before + time.monotonic() - started
+        at, seconds = population.counters, offset + time.monotonic()
         for number, member in list(alive.items()):
             if lost := not_finite(metrics[number]):
                 finish(folder, member.name, Ending(DIVERGED, f"{lost} by episode {at.episodes}"))
                 del alive[number]
                 continue
             member.rows.append(trainer.row(at, seconds, metrics[number]))
+            logs[number].epoch(member.rows[-1])
             if at.steps % (budget.checkpoint_every // budget.num_envs * length) == 0 or at.steps >= program.total_steps:
                 member.write_rows()
                 member.checkpoints.save(population.member(number))
-    for member in alive.values():
-        report.write(member.run.folder, member.run.config, program.env, member.rows, member.evaluations)
-        finish(folder, member.name, Ending(DONE))

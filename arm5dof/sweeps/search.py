@@ -56,8 +56,8 @@ def _study(path: Path, asked: Search | None = None, higher: bool = False, seed: 
 class Trials:
     """The jobs of a search: those of trials that were begun, then new ones."""
 
-    def __init__(self, current: Sweep) -> None:
-        self._current, self._asked = current, current.spec
+    def __init__(self, current: Sweep, loggers: tuple[str, ...] = ()) -> None:
+        self._current, self._asked, self._loggers = current, current.spec, loggers
         assert self._asked.search is not None
         self._search = self._asked.search
         path = current.folder / STUDY
@@ -82,7 +82,9 @@ class Trials:
         if wanted not in self._shapes:
             self._shapes.append(wanted)
         pruned = (str((self._current.folder / STUDY).absolute()), trial.number) if self._search.prune else None
-        return Job.of(self._current.members_folder, found, group=self._shapes.index(wanted), trial=pruned)
+        return Job.of(
+            self._current.members_folder, found, group=self._shapes.index(wanted), trial=pruned, loggers=self._loggers
+        )
 
     def ended(self, job: Job) -> None:
         """Tell Optuna how a trial ended."""

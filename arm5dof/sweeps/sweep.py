@@ -6,7 +6,7 @@ import contextlib
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -20,6 +20,7 @@ from arm5dof.sweeps.local import ATTEMPTS, Jobs, LocalExecutor
 from arm5dof.sweeps.results import Row
 from arm5dof.sweeps.spec import Member, Spec
 from arm5dof.sweeps.worker import DONE, FAILED, Ending, Job, ended, finish
+from arm5dof.training.loggers import make_loggers
 from arm5dof.training.run import Reporter, Silent, free_folder
 
 WRITE_EVERY_S = 20.0
@@ -35,6 +36,7 @@ def sweep(
     address: str | None = None,
     resume: bool = False,
     reporter: Reporter | None = None,
+    loggers: str | Iterable[str] = (),
 ) -> Sweep:
     """Train every member of a sweep, and put what was measured into one table.
 
@@ -46,6 +48,7 @@ def sweep(
         address: Of a Ray cluster; None for one that is at hand or else a local one.
         resume: Go on with the sweep in `out`, of which nothing is done twice.
         reporter: Told how it goes: members done, and the best so far.
+        loggers: Where the curves of each member go besides its folder: "tensorboard", "wandb", or both.
 
     Returns:
         The sweep.
@@ -63,7 +66,8 @@ def sweep(
     >>> [row["status"] for row in done.table], len(done.summary()), done.best.config.task
     (['done', 'done'], 2, 'reach')
     """
-    reporter = reporter or Silent()
+    reporter, names = reporter or Silent(), tuple(loggers.split(",") if isinstance(loggers, str) else loggers)
+    make_loggers(names)  # What they lack is said at once; each member has its own.
     asked = asked if isinstance(asked, Spec) else spec.parse(asked) if isinstance(asked, Mapping) else spec.read(asked)
     if asked.base.task.startswith("__main__:"):
         raise UserError(f"the task {asked.base.task} lives in the main program: put it into a file of its own")
@@ -91,11 +95,11 @@ def sweep(
             current.spec = asked
             files.write_text(folder / "sweep.toml", asked.dumps())
             if asked.search is None:
-                jobs: Jobs = Queue(current, planned, sizes)
+                jobs: Jobs = Queue(current, planned, sizes, names)
             else:
                 from arm5dof.sweeps.search import Trials
 
-                jobs = Trials(current)
+                jobs = Trials(current, names)
             if isinstance(runner, LocalExecutor):
                 runner.keep_open = descriptor
             _drive(current, runner, jobs, reporter)
@@ -117,13 +121,16 @@ class Queue:
     """The jobs of a grid that are left to do, by program shape: a worker stays with its own while that has some, and
     then goes where the fewest are."""
 
-    def __init__(self, current: Sweep, planned: Sequence[groups.Group], sizes: Sequence[int]) -> None:
+    def __init__(
+        self, current: Sweep, planned: Sequence[groups.Group], sizes: Sequence[int], loggers: tuple[str, ...]
+    ) -> None:
         self._waiting: dict[int, list[Job]] = {}
         self._given = Counter[int]()
         for number, (group, size) in enumerate(zip(planned, sizes, strict=True)):
             left = [m for m in group.members if _is_left(current.members_folder, m.name)]
             chunks = [left[i : i + size] for i in range(0, len(left), size)]
-            jobs = [Job.of(current.members_folder, c, group=number, together=size > 1) for c in chunks]
+            shared = {"group": number, "together": size > 1, "loggers": loggers}
+            jobs = [Job.of(current.members_folder, chunk, **shared) for chunk in chunks]
             if jobs:
                 self._waiting[number] = jobs[::-1]
 

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -53,6 +53,8 @@ class Job:
     """Whether they are one program, which pays on a GPU."""
     trial: tuple[str, int] | None = None
     """The file of a search and the number of its trial that these are the seeds of: whether to prune it is asked."""
+    loggers: tuple[str, ...] = ()
+    """Where curves go besides the run folders; see `training.loggers`."""
 
     @staticmethod
     def of(folder: Path, members: list[Member], **others: Any) -> Job:
@@ -68,7 +70,8 @@ class Job:
         """From that line."""
         values = json.loads(line)
         trial = values["trial"] and tuple(values["trial"])
-        return Job(**{**values, "members": tuple(map(tuple, values["members"])), "trial": trial})
+        members, loggers = tuple(map(tuple, values["members"])), tuple(values["loggers"])
+        return Job(**{**values, "members": members, "trial": trial, "loggers": loggers})
 
 
 class DivergedError(Exception):
@@ -110,7 +113,7 @@ class Worker:
 
             todo = [(name, _built(text)) for name, text in job.members if not ended(folder, name)]
             if todo:
-                ending = attempt(lambda: train_together(self._program(todo[0][1]), folder, todo))
+                ending = attempt(lambda: train_together(self._program(todo[0][1]), folder, todo, job.loggers))
                 for name in [name for name, _ in todo if not ended(folder, name)]:
                     finish(folder, name, ending)
             return
@@ -125,7 +128,8 @@ class Worker:
                     from arm5dof.sweeps.search import should_stop
 
                     stop = should_stop(*job.trial, number)
-                found = finish(folder, name, attempt(partial(self._train, folder / name, _built(text), stop)))
+                train = partial(self._train, folder / name, _built(text), stop, job.loggers)
+                found = finish(folder, name, attempt(train))
             if job.trial is not None and found.status != DONE:
                 decided = f"{name} {found.status}"
 
@@ -139,7 +143,9 @@ class Worker:
             self._trainer, self._shape = Finite(config.make_env(settings), settings), wanted
         return self._trainer
 
-    def _train(self, folder: Path, settings: Config, stop: Callable[[Run], bool] | None) -> None:
+    def _train(
+        self, folder: Path, settings: Config, stop: Callable[[Run], bool] | None, loggers: Sequence[str]
+    ) -> None:
         """As `training.run.train` does, or `resume` where there is a run."""
         if folder.exists():
             opened = Run.open(folder)
@@ -152,7 +158,7 @@ class Worker:
             made = self._program(settings).again(settings)
             opened = Run.create(settings, folder, made.env)
         _wait_until_free(opened)
-        run.resume(opened, _Stopping(opened, stop) if stop else None, made)
+        run.resume(opened, _Stopping(opened, stop) if stop else None, made, loggers)
 
 
 def _wait_until_free(opened: Run) -> None:

@@ -218,3 +218,11 @@ def test_memory_is_at_least_what_a_state_takes(experiment):
     config = load_config(experiment)
     made = trainer.Trainer(make_env(config), config)
     assert member_bytes(config) >= 2 * made.replay_bytes
+
+
+def test_members_log_where_they_are_told_to(experiment, tmp_path):
+    asked = {"base": str(experiment), "axes": {"seed": {"count": 1}}}
+    assert said(lambda: sweep(asked, tmp_path / "none", loggers="tensorbord")).startswith("no logger 'tensorbord'")
+    assert not (tmp_path / "none").exists()
+    done = sweep(asked, tmp_path / "logged", workers=1, loggers="tensorboard")
+    assert list((done.runs["m0000"].folder / "tensorboard").glob("events.out.tfevents.*"))
