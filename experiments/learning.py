@@ -2,7 +2,7 @@
 
     python experiments/learning.py budgets      sweep_budgets.toml and sweep_ten_seeds.toml, into experiments/results/
     python experiments/learning.py ablations    sweep_ablations.toml
-    python experiments/learning.py poses        sweep_poses.toml: positions and directions (reach_pose)
+    python experiments/learning.py poses        sweep_poses.toml, sweep_poses7.toml: positions, directions (reach_pose)
 
 All rows are judged on 10,000 unseen targets at the end of training. The sweeps are left in runs/learning/, and go on if
 they are there already: `arm5dof sweep experiments/sweep_budgets.toml --out runs/learning/sweep_budgets` does the same.
@@ -26,7 +26,7 @@ HERE = Path(__file__).parent
 TABLES = {
     "budgets": ("sweep_budgets", "sweep_ten_seeds"),
     "ablations": ("sweep_ablations",),
-    "poses": ("sweep_poses",),
+    "poses": ("sweep_poses", "sweep_poses7"),
 }
 
 
