@@ -17,8 +17,8 @@ from arm5dof.sweeps.worker import Job, Worker
 
 try:
     import ray
-except ImportError:
-    raise UserError("the executor ray takes Ray: pip install 'arm5dof[ray]'") from None
+except ImportError:  # An extra; the module can be imported without.
+    ray = None
 
 PATIENCE_S = 5.0
 
@@ -32,10 +32,12 @@ class RayExecutor:
         address: Of the cluster; None for one that is at hand, or else a local one, which ends with the sweep.
 
     Raises:
-        UserError: The cluster cannot be reached.
+        UserError: Ray is not installed, or the cluster cannot be reached.
     """
 
     def __init__(self, workers: int | None = None, address: str | None = None) -> None:
+        if ray is None:
+            raise UserError("the executor ray takes Ray: pip install 'arm5dof[ray]'")
         self._ours = not ray.is_initialized()
         if self._ours:
             _reach(address or os.environ.get("RAY_ADDRESS"))
