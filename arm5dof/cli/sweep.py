@@ -91,7 +91,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> int | None:
                 address=args.address,
                 resume=args.resume,
                 reporter=bar,
-                loggers=args.log.split(",") if args.log else (),
+                loggers=args.log or (),
             )
     except KeyboardInterrupt:
         named = f"{args.sweep} " if args.sweep else ""

@@ -242,14 +242,8 @@ def _by_full_name(base: Config, values: Mapping[str, Any], where: str) -> dict[s
 def _search(given: Any) -> Search | None:
     if given is None:
         return None
-    names = list(Search.__dataclass_fields__)
-    for key in _flat("search", given):
-        if key not in names:
-            raise UserError(f"unknown key 'search.{key}': {nearest_hint(key, names)}")
-    try:
-        return Search(**given)
-    except UserError as error:
-        raise UserError(f"search.{error}") from None
+    found: Search = config.build_section("search", Search, _flat("search", given))
+    return found
 
 
 def _axis(name: str, full: str, said: Any, sample_seed: int | None, search: Search | None) -> Axis:

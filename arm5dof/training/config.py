@@ -124,7 +124,7 @@ def override(config: Config, values: Mapping[str, Any]) -> Config:
         found = find(name, known)
         given.setdefault(found.section, {})[found.name] = _parse(value, found.value)
     now = {section: getattr(config, section) for section in given}
-    changed = {name: _section(name, type(now[name]), {**vars(now[name]), **given[name]}) for name in given}
+    changed = {name: build_section(name, type(now[name]), {**vars(now[name]), **given[name]}) for name in given}
     return dataclasses.replace(config, **changed)
 
 
@@ -153,7 +153,7 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
         shipped = {} if path is None else _read(path)
         merged = {section: {**shipped.get(section, {}), **values.get(section, {})} for section in SECTIONS}
         merged["env"].pop("task", None)
-        return Config(task, **{name: _section(name, classes[name], merged[name]) for name in SECTIONS})
+        return Config(task, **{name: build_section(name, classes[name], merged[name]) for name in SECTIONS})
     except UserError as error:
         raise UserError(f"{source}: {error}" if source else str(error)) from None
 
@@ -262,7 +262,8 @@ class UnknownSettingError(UserError):
         self.name, self.nearest = name, nearest
 
 
-def _section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
+def build_section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
+    """The settings of a section, by its name and class. Raises `UserError` for an unknown key or a wrong value."""
     names = [f.name for f in dataclasses.fields(cls)]
     for key in values:
         if key not in names:
