@@ -21,8 +21,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from arm5dof.grasp.driver import CLEARANCE
 from arm5dof.grasp.evaluation import Program, Setting, evaluate
-from arm5dof.grasp.grasper import CLEARANCE, Grasper
+from arm5dof.grasp.grasper import Grasper
 from arm5dof.grasp.jobs import Step
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import Disturbance

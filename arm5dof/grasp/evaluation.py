@@ -16,7 +16,8 @@ import numpy as np
 
 from arm5dof.arm import load_arm
 from arm5dof.errors import UserError
-from arm5dof.grasp.grasper import CLEARANCE, Grasper, checked_place
+from arm5dof.grasp.driver import CLEARANCE
+from arm5dof.grasp.grasper import Grasper, checked_place
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.ground_truth import TrueBoxes, TruePositions, in_sight
 from arm5dof.grasp.jobs import CLASS, Step, perform
@@ -29,6 +30,7 @@ from arm5dof.grasp.world import World
 from arm5dof.runtime import xla
 from arm5dof.training.policy_file import load_policy
 from arm5dof.vision.detectors.loading import load_detector
+from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 from arm5dof.vision.objects import CLASS_NAMES
 from arm5dof.vision.synthetic.scenes import MAX_AZIMUTH, MAX_OBJECTS
 
@@ -45,8 +47,8 @@ HOLD = 2.0
 """Seconds for which an object must be held."""
 LIFT = 0.05
 """Metres by which it must be lifted."""
-FAINT = 0.1
-"""So little confidence is enough at the second look."""
+FAINT = 0.07
+"""What is seen with less confidence at the second look is not told."""
 ROOM, HEIGHT = 0.06, 0.02
 """To put something down is for a place from which all else is so far, and which the arm reaches at such a height,
 metres."""
@@ -133,9 +135,8 @@ class Program:
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
         self._empty = World(self.planner.arm)
-        self.detectors = (
-            [load_detector(), load_detector(confidence=FAINT, tta=True)] if setting.eyes == "camera" else []
-        )
+        second = partial(TabletopDetector, confidence=FAINT, iou=0.45, tta=True, windows=True)
+        self.detectors = [load_detector(), second()] if setting.eyes == "camera" else []
 
     def scene(self, number: int) -> TabletopScene:
         """A random scene, the arm at rest out of the camera's way."""

@@ -3,43 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.grasp.bins import HEIGHT as BIN_HEIGHT
-from arm5dof.grasp.bins import Bin
-from arm5dof.grasp.gripper import Gripper
+from arm5dof.grasp.bins import PILED, Bin
+from arm5dof.grasp.driver import Driver
+from arm5dof.grasp.gripper import Gripper, least_width
 from arm5dof.grasp.outcome import Outcome, Stage
 from arm5dof.grasp.perception import Perception, SeenObject
 from arm5dof.grasp.planner import Approach, Planner
 from arm5dof.grasp.robot import Robot
-from arm5dof.grasp.world import World
+from arm5dof.grasp.world import Held
 from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES, CatalogueObject
 
-CLEARANCE = 0.06
-"""From how far above a point is approached, and how high objects are lifted, metres."""
 SLACK = 0.008
 """How much wider than an object the gripper opens, metres."""
 SQUEEZE = 0.02
 """How much narrower than an object it is told to close, metres: what makes the grip firm."""
-SPEED = 1.5
-"""Of the fastest joint on the way, rad/s, and a third of it on the line to an object."""
+SURE, LIKELY = 0.5, 0.1
+"""What was asked for and is seen with less confidence than the first is looked at again; and then less than the second
+does not count."""
 DOUBT = 0.6
 """Of less confidence, what is seen is taken for an obstacle at the first attempt only."""
 ATTEMPTS = 3
 """From as many images."""
-PLACED = 0.006
-"""What is seen further from where it should lie is picked and put there again, metres: a gripper does not know where
-along its fingers it holds an object."""
+PLACED, MISPLACED = 0.006, 0.010
+"""What is seen further from where it should lie, metres, is picked and put there again, since a gripper does not know
+where along its fingers it holds an object; and what is seen further is not done."""
 BESIDE = 0.06
 """What was just put down is seen no further away, metres."""
 DROP = 0.003
 """Above where it will rest an object is let go, metres."""
-ARRIVED = 0.05
-"""Where a joint is further from its target, something is in the way, radians."""
-WIDER = 0.004
-"""What is held may be so much wider than its class, metres."""
+BESIDE_WALL = 0.85
+"""How far from a bin's middle an object comes into a corner, of how far it could: what slipped a little between the
+fingers does not come down on a wall."""
+FINGERTIPS = 0.011
+"""How far below what they hold fingers reach, and a little, metres: they open above a bin's walls."""
+NARROWER, WIDER = 0.002, 0.004
+"""What is held may be so much narrower or wider than its class, metres."""
 LEAST = 0.002
 """An object between the fingers is at least so wide, metres."""
 SAME = 0.01
@@ -85,56 +89,67 @@ class Grasper:
     ) -> None:
         self.robot, self.perception, self.planner, self.rest = robot, perception, planner, rest
         self.bins = {one.name: one for one in bins}
+        self._driver = Driver(robot, planner, rest, self.bins.values())
         self._second, self._say = second_look, on_stage
-        self._objects: list[SeenObject] = []
-        self._held: CatalogueObject | None = None
         self._from: np.ndarray | None = None
+        self._seen_before: list[SeenObject] = []
         self._filled: dict[str, int] = {}
         self._met: list[np.ndarray] = []
         self._nothing: list[np.ndarray] = []
+        self._failed: list[np.ndarray] = []
         self._widest = Gripper.of(planner.arm.mj_model).limits[1]
 
     @property
     def holds(self) -> str | None:
         """The class of what it holds, as far as it knows."""
-        return None if self._held is None else self._held.name
+        return None if self._driver.held is None else self._driver.held.kind.name
 
     def look(self, again: bool = False) -> list[SeenObject]:
         """What is seen now, but for what lies in a bin. `again` takes the second look."""
         self._say("look again" if again else "look")
         perception = self._second if again and self._second is not None else self.perception
         seen = perception(self.robot.image())
-        return [one for one in seen if one.position is None or not self._in_a_bin(one.position)]
+        return [one for one in seen if one.position is None or not any(self._in(b, one) for b in self.bins.values())]
 
-    def _in_a_bin(self, position: np.ndarray) -> bool:
-        flat = np.append(position[:2], 0.0)  # What lies on something else in there is in it too.
-        return any(one.contains(flat[None])[0] for one in self.bins.values())
+    def _in(self, bin: Bin, seen: SeenObject) -> bool:
+        """Whether it lies in a bin, or on what was put there, which shows it further from the camera than it is."""
+        assert seen.position is not None
+        low = seen.position
+        if bin.name not in self._filled or seen.eye is None or seen.eye[2] <= PILED:
+            return bool(bin.contains(np.append(low[:2], 0.0)[None])[0])
+        share = np.linspace(0, (PILED - low[2]) / (seen.eye[2] - low[2]), 10, endpoint=False)[:, None]
+        return bool(bin.contains(low + share * (seen.eye - low)).any())
 
-    def pick(self, name: str) -> Outcome:
+    def pick(self, name: str, doubtful: bool = False) -> Outcome:
         """Pick up an object of a class and hold it, `CLEARANCE` above where it was.
 
         Args:
             name: Of the class.
+            doubtful: Whether to try what may well not be there too, as in clearing a table.
 
         Returns:
-            What came of it. Unless it is `done` the arm is at rest and the gripper empty.
+            What came of it. Unless it is `done` or `rest` the arm is at rest and the gripper empty.
 
         Raises:
             UserError: There is no such class, or something is held already.
         """
         if name not in CLASS_NAMES:
             raise UserError(f"no class {name!r}: the detector knows {', '.join(CLASS_NAMES)}")
-        if self._held is not None:
-            raise UserError(f"the gripper holds the {self._held.name}: place it first, or put it back")
-        outcome, again = Outcome("see"), False
-        self._met, self._nothing = [], []
+        if self.holds:
+            raise UserError(f"the gripper holds the {self.holds}: place it first, or put it back")
+        outcome, again = Outcome("see"), doubtful
+        self._met, self._nothing, self._failed = [], [], []
         for attempt in range(1, ATTEMPTS + 1):
-            outcome = self._attempt(name, attempt, again)
-            unseen = outcome.stage in ("see", "locate")
+            seen = self.look(again)
+            sure = any(one.name == name and one.position is not None and one.confidence >= SURE for one in seen)
+            if not (again or sure) and self._second is not None:
+                again, seen = True, self.look(again=True)
+            seen = [one for one in seen if doubtful or one.name != name or one.confidence >= LIKELY]
+            outcome = self._attempt(name, attempt, seen)
             # Another image of the same table shows the same.
-            if outcome.success or outcome.stage == "reach" or (unseen and (again or self._second is None)):
+            if outcome.success or outcome.stage in ("see", "locate", "reach", "rest"):
                 break
-            again |= unseen or outcome.stage == "collide"
+            again = True
         return outcome
 
     def place(
@@ -157,86 +172,94 @@ class Grasper:
             raise UserError("place takes a point, the name of a bin, or the class of what it is put on")
         if bin is not None and bin not in self.bins:
             raise UserError(f"no bin {bin!r}: there are {', '.join(self.bins) or 'none'}")
-        if self._held is None:
-            raise UserError("nothing is held: pick something first")
+        kind = self._kind_held()
         if on is not None:
-            below = next((one for one in self._objects if one.name == on), None)
+            below = next((one for one in self._driver.objects if one.name == on), None)
             if below is None:
                 return Outcome("see", f"no {on} is seen to put it on")
             assert below.position is not None
-            where, height = below.position[:2], 2 * below.position[2] + self._held.half_height + DROP
+            where, height = below.position[:2], 2 * below.position[2] + kind.half_height + DROP
         elif bin is not None:
-            where, height = self._free(self.bins[bin])
+            where, height = self._free(self.bins[bin], kind)
         else:
             assert point is not None
-            return self._put_exactly(checked_place(point), self._held)
+            return self._put_exactly(checked_place(point), kind)
         return self._put(where, height)
 
     def _put_exactly(self, where: np.ndarray, kind: CatalogueObject) -> Outcome:
         """Put down what is held, see where it came to lie, and pick it up again while that is elsewhere."""
-        outcome = self._put(where, kind.half_height + DROP)
-        for _ in range(ATTEMPTS - 1):
-            if not outcome.success:
-                break
-            found = self._nearest(kind.name, where)
-            if found is None or found <= PLACED or not self._attempt(kind.name, 1, False, where).success:
-                break
+        before = self._seen_before
+        for attempt in range(1, ATTEMPTS + 1):
             outcome = self._put(where, kind.half_height + DROP)
-        return outcome
+            found = self._beside(where, kind.name, before) if outcome.success else None
+            if found is None or _away(found, where) <= PLACED:
+                return outcome
+            off = f"it lies {1e3 * _away(found, where):.0f} mm from the place"
+            if attempt == ATTEMPTS:
+                break
+            again = self._attempt(kind.name, 1, self.look(), found)
+            if not again.success:
+                off = f"{off}, and {again.reason}"
+                break
+        return Outcome("place", off) if _away(found, where) > MISPLACED else outcome
 
-    def _nearest(self, name: str, where: np.ndarray) -> float | None:
-        """How far from a place an object of a class is seen, metres, if it is no further than `BESIDE`, and not where
-        it was picked."""
+    def _beside(self, where: np.ndarray, name: str, before: Sequence[SeenObject]) -> SeenObject | None:
+        """What of a class is seen nearest to a place, unless it is too far from it to be what was put there, or was
+        seen there before."""
         seen = [one for one in self.look() if one.name == name and one.position is not None]
-        away = [_away(one, where) for one in seen if self._from is None or _away(one, self._from) > SAME]
-        return min((d for d in away if d <= BESIDE), default=None)
+        new = [
+            one
+            for one in seen
+            if _away(one, where) <= SAME or all(_away(one, old.position[:2]) > SAME for old in before)
+        ]
+        nearest = min(new, key=lambda one: _away(one, where), default=None)
+        return nearest if nearest is not None and _away(nearest, where) <= BESIDE else None
 
-    def _free(self, bin: Bin) -> tuple[np.ndarray, float]:
+    def _free(self, bin: Bin, kind: CatalogueObject) -> tuple[np.ndarray, float]:
         """Where in a bin, and how high, what is held is let go: in one corner after the other, opposite ones first; or,
         where two would not fit in opposite corners, on top of each other."""
-        assert self._held is not None
         count = self._filled[bin.name] = self._filled.get(bin.name, -1) + 1
-        if self._held.radius > 2**0.5 * (bin.room - self._held.radius):
-            pile = 2 * self._held.half_height * count + DROP
-            return bin.position, self._held.half_height + max(BIN_HEIGHT, pile)
+        lowest = max(kind.half_height + DROP, BIN_HEIGHT + FINGERTIPS)
+        aside = BESIDE_WALL * (bin.room - kind.radius)
+        if kind.radius > 2**0.5 * aside:
+            pile = kind.half_height * (2 * count + 1) + DROP
+            return bin.position, max(lowest, pile)
         along = np.array([np.cos(bin.yaw), np.sin(bin.yaw)])
         corner = np.array([(1, 1), (-1, -1), (1, -1), (-1, 1)][count % 4])
-        aside = (bin.room - self._held.radius) * corner
-        return bin.position + aside @ np.stack([along, [-along[1], along[0]]]), self._held.half_height + BIN_HEIGHT
+        return bin.position + aside * corner @ np.stack([along, [-along[1], along[0]]]), lowest
 
     def put_back(self) -> Outcome:
         """Put down what is held where it was picked up, and go to rest."""
-        if self._held is None or self._from is None:
+        kind = self._kind_held()
+        assert self._from is not None
+        return self._put(self._from, kind.half_height + DROP)
+
+    def _kind_held(self) -> CatalogueObject:
+        if self._driver.held is None:
             raise UserError("nothing is held: pick something first")
-        return self._put(self._from, self._held.half_height + DROP)
+        return self._driver.held.kind
 
     def _put(self, where: np.ndarray, height: float) -> Outcome:
         self._say(f"place at {1e3 * where[0]:.0f} {1e3 * where[1]:.0f} mm")
         opening = self.robot.opening()
-        way = self._approach(np.append(where, height), opening)
+        way = self._driver.approach(np.append(where, height), opening)
         if isinstance(way, str):
             return Outcome("place", f"the place is {way}")
-        self._go(way)
+        self._driver.go(way)
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way", way)
         self.robot.grip(opening + SLACK)
-        self._held = None
-        self._retreat(way)
-        self._go_to_rest()
-        return Outcome("done")
+        self._driver.held = None
+        self._driver.retreat(way)
+        return self._rest(Outcome("done"))
 
-    def _attempt(self, name: str, attempt: int, again: bool, near: np.ndarray | None = None) -> Outcome:
-        """Try once to pick an object of a class, the one that is nearest to a place or else the surest."""
-        seen = self.look(again)
+    def _attempt(self, name: str, attempt: int, seen: list[SeenObject], near: SeenObject | None = None) -> Outcome:
+        """Try once to pick an object of a class, the one that is nearest to where one was seen or else the surest."""
         wanted = [one for one in seen if one.name == name and not self._is_nothing(one)]
         located = [one for one in wanted if one.position is not None]
         if near is not None:
-            located = sorted(located, key=lambda one: _away(one, near))[:1]
-        # Where everything would collide, the doubtful may not be there.
-        doubt = 0.0 if attempt == 1 else DOUBT
-        self._objects = [
-            one for one in seen if one.position is not None and (one.confidence >= doubt or one.name == name)
-        ]
+            located = sorted(located, key=lambda one: _away(one, near.position[:2]))[:1]
+        located.sort(key=self._failed_at)  # Where one failed is tried after the others.
         if not wanted:
             return Outcome("see", f"no {name} is seen", attempt)
         if not located:
@@ -245,14 +268,22 @@ class Grasper:
         outcome = Outcome("reach")
         for target in located:
             assert target.position is not None
+            # Where everything would collide, the doubtful may not be there.
+            doubt = 0.0 if attempt == 1 else DOUBT
+            self._driver.objects = [
+                one for one in seen if one.position is not None and (one.confidence >= doubt or one is target)
+            ]
             self._say(f"plan: {name} at {1e3 * target.position[0]:.0f} {1e3 * target.position[1]:.0f} mm")
             opening = min(2 * kind.radius + SLACK, self._widest)
-            way = self._approach(target.position, opening, target)
+            way = self._driver.approach(target.position, opening, target, self._met)
             if not isinstance(way, str):
                 return self._grasp(way, target, kind, opening, attempt)
             stage: Stage = "reach" if way == "out of reach" else "collide"
             outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, target.position)
         return outcome
+
+    def _failed_at(self, seen: SeenObject) -> bool:
+        return any(np.linalg.norm(seen.position - other) < SAME for other in self._failed)
 
     def _is_nothing(self, seen: SeenObject) -> bool:
         """Whether the fingers closed there on nothing, and it is doubtful too."""
@@ -260,62 +291,48 @@ class Grasper:
             return False
         return any(np.linalg.norm(seen.position - other) < SAME for other in self._nothing)
 
-    def _approach(self, point: np.ndarray, opening: float, target: SeenObject | None = None) -> Approach | str:
-        world = World(self.planner.arm, self.bins.values(), self._objects)
-        without = None if target is None else self._objects.index(target)
-        return self.planner.approach(world, self.robot.joints(), point, CLEARANCE, opening, without, self._met)
-
     def _grasp(self, way: Approach, target: SeenObject, kind: CatalogueObject, opening: float, attempt: int) -> Outcome:
         assert target.position is not None
         self._say(f"grasp the {target.name}")
         self.robot.grip(opening)
-        self._go(way)
-        if np.abs(self.robot.joints() - way.line[-1]).max() > ARRIVED:
+        if not self._driver.go(way):
             self._met.append(way.direction)
             return self._give_up("collide", "the arm met something on the way", way, attempt, target)
         self.robot.grip(-SQUEEZE)
         if self.robot.opening() < LEAST:
             self._nothing.append(target.position)
             return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
-        if self.robot.opening() > 2 * kind.radius + WIDER:
+        if not least_width(kind) - NARROWER <= self.robot.opening() <= 2 * kind.radius + WIDER:
             self._met.append(way.direction)
             return self._give_up("identify", f"what is between the fingers is no {target.name}", way, attempt, target)
         self._say("lift")
-        self._retreat(way)
+        self._driver.retreat(way)
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way up", way, attempt, target)
-        self._objects = [one for one in self._objects if one is not target]
-        self._held, self._from, self._met = kind, target.position[:2], []
+        self._seen_before = [one for one in self._driver.objects if one.name == target.name]
+        self._driver.objects.remove(target)
+        self._driver.held = Held(kind, way.line[-1])
+        self._from, self._met = target.position[:2], []
         return Outcome("done", attempts=attempt, position=target.position)
 
     def _give_up(
         self, stage: Stage, reason: str, way: Approach, attempt: int = 1, target: SeenObject | None = None
     ) -> Outcome:
         self._say(f"give up: {reason}")
-        self._held = None
+        if target is not None:
+            self._failed.append(target.position)
+        self._driver.held = None
         self.robot.grip(min(max(self._widest / 2, self.robot.opening() + SLACK), self._widest))
-        if np.abs(self.robot.joints() - way.line[-1]).max() < np.abs(self.robot.joints() - way.line[0]).max():
-            self._retreat(way)
-        self._go_to_rest()
-        return Outcome(stage, reason, attempt, None if target is None else target.position)
+        self._driver.retreat(way)
+        return self._rest(Outcome(stage, reason, attempt, None if target is None else target.position))
 
-    def _go(self, way: Approach) -> None:
-        self._follow(way.transit[1:], SPEED)
-        self._follow(way.line[1:], SPEED / 3)
-
-    def _retreat(self, way: Approach) -> None:
-        self._follow(way.line[-2::-1], SPEED / 3)
-
-    def _go_to_rest(self) -> None:
+    def _rest(self, outcome: Outcome) -> Outcome:
+        """Go to rest; an outcome that says so if there is no way."""
         self._say("rest")
-        world = World(self.planner.arm, self.bins.values(), self._objects)
-        path = self.planner.transit(world, self.robot.joints(), self.rest, self.robot.opening())
-        self._follow(np.stack([self.rest]) if path is None else path[1:], SPEED)
-
-    def _follow(self, path: np.ndarray, speed: float) -> None:
-        before = np.concatenate([[self.robot.joints()], path[:-1]])
-        seconds = np.maximum(np.abs(path - before).max(1) / speed, 0.02)
-        self.robot.move(np.cumsum(seconds), path)
+        if self._driver.go_to_rest():
+            return outcome
+        reason = f"{outcome.reason or outcome.stage}, and no clear way leads to where the arm rests"
+        return replace(outcome, stage="rest", reason=reason)
 
 
 def _away(seen: SeenObject, where: np.ndarray) -> float:

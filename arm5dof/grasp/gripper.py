@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import mujoco
 import numpy as np
 
 from arm5dof.arm.loading import SLIDE, position_actuator, servo_line
 from arm5dof.errors import UserError
+from arm5dof.vision.objects import CatalogueObject
 
 SITE = "grasp"
 """Name of the site between the fingers, where an object is held."""
@@ -106,6 +108,22 @@ class Gripper:
     def to_ctrl(self, fingers: np.ndarray) -> np.ndarray:
         """What to tell the actuators, (2,), so that the fingers come to rest at joint positions (2,)."""
         return self.servo[:, 0] * fingers + self.servo[:, 1]
+
+
+@cache
+def least_width(kind: CatalogueObject) -> float:
+    """The least distance between fingers that hold an object from two sides, metres: through its center, level."""
+    spec = mujoco.MjSpec()
+    for part in kind.parts:
+        size = [*part.size, *[0.0] * (3 - len(part.size))]
+        spec.worldbody.add_geom(type=part.kind, size=size, pos=part.position, quat=part.quaternion)
+    model = spec.compile()
+    data, geom = mujoco.MjData(model), np.empty(1, np.int32)
+    mujoco.mj_forward(model, data)
+    angles = np.deg2rad(np.arange(180))
+    ways = np.stack([np.cos(angles), np.sin(angles), np.zeros(180)], 1)
+    outside = 2 * kind.radius
+    return 2 * (outside - max(mujoco.mj_ray(model, data, outside * u, -u, None, 1, -1, geom) for u in ways))
 
 
 def _carries(model: mujoco.MjModel, body: int, other: int) -> bool:

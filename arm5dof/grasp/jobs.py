@@ -102,9 +102,7 @@ def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
         moved, failed = 0, dict[str, int]()
         for _ in range(MOST):
             # What failed is tried again when something else is out of its way, after what did not fail.
-            names = [n for n in _seen(grasper) if failed.get(n) != moved] or [
-                n for n in _seen(grasper, again=True) if failed.get(n) != moved
-            ]
+            names = [n for n in _seen(grasper) if failed.get(n) != moved]
             if not names:
                 break
             name = min(names, key=lambda n: n in failed)
@@ -118,13 +116,13 @@ def perform(grasper: Grasper, steps: Iterable[Step]) -> list[Done]:
     return done
 
 
-def _seen(grasper: Grasper, again: bool = False) -> list[str]:
+def _seen(grasper: Grasper) -> list[str]:
     """Classes of what can be located, the surest first, each once."""
-    return list(dict.fromkeys(one.name for one in grasper.look(again) if one.position is not None))
+    return list(dict.fromkeys(one.name for one in grasper.look(again=True) if one.position is not None))
 
 
 def _move(grasper: Grasper, name: str, step: Step) -> Outcome:
-    picked = grasper.pick(name)
+    picked = grasper.pick(name, doubtful=step.pick == ANY)
     if not picked.success:
         return picked
     placed = grasper.place(step.place, name if step.bin == CLASS else step.bin, step.on)

@@ -7,10 +7,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
-Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "done"]
+Stage = Literal["see", "locate", "reach", "collide", "grip", "lift", "identify", "place", "rest", "done"]
 """Where an attempt ended. see: no object of the class was seen; locate: none could be located; reach: the policy has no
 answer; collide: every motion would hit something; grip: the fingers closed on nothing; lift: what they held was lost;
-identify: what they hold is wider than the class can be; place: no way to where it should go; done: as asked."""
+identify: what they hold is wider than the class can be; place: no way to where it should go, or it came to
+lie elsewhere; rest: no clear way back, so that the arm stays where it is; done: as asked."""
 
 STAGES: tuple[Stage, ...] = get_args(Stage)
 

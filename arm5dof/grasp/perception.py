@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.grasp.outline import size_misfit
 from arm5dof.vision.boxes import iou
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detector
+from arm5dof.vision.localization.common import cut_edges
 from arm5dof.vision.localization.solids import CATALOGUE_SOLIDS
 from arm5dof.vision.localization.table_plane import by_plane
 
@@ -29,10 +31,16 @@ class SeenObject:
     """The largest standard deviation of the position in any direction, metres; NaN without one."""
     failure: str = ""
     """Why it has no position."""
+    eye: np.ndarray | None = None
+    """Where it was seen from, (3,), metres, base frame, if that is known: were it higher than thought, it would be
+    nearer to that."""
 
 
 SURE = 0.25
 """Of less confidence, something counts only where nothing more certain is."""
+MISFIT, UNLIKE = 0.2, 0.1
+"""What looks so much larger or smaller than its class would there, as a logarithm, is of another class or half hidden:
+it is so many times as sure."""
 SAME = 0.3
 """Boxes whose intersection over union is larger may be of one object."""
 
@@ -66,17 +74,29 @@ class CameraPerception:
             raise UserError(f"the image is {size}, the camera was calibrated for {wanted}: give one of its own")
         detections = self.detector(image)
         found = by_plane(detections, self.camera, CATALOGUE_SOLIDS, box_std=self.box_std, cut=True)
+        eye = np.asarray(self.camera.position, float)
         names = detections.data["class_name"]
-        sure = detections.confidence >= SURE
+        confidence = detections.confidence.astype(float)
+        for i, failure in enumerate(found.failure):
+            if not failure and self._is_misfit(str(names[i]), detections.xyxy[i], found.position[i]):
+                confidence[i] *= UNLIKE
+        sure = confidence >= SURE
         same = (iou(detections.xyxy[:, None], detections.xyxy[sure]) > SAME).any(1)
-        return [
+        seen = [
             SeenObject(
                 str(names[i]),
-                float(detections.confidence[i]),
+                float(confidence[i]),
                 None if failure else found.position[i],
                 float("nan") if failure else float(np.sqrt(np.linalg.eigvalsh(found.covariance[i])[-1])),
                 failure,
+                eye,
             )
             for i, failure in enumerate(found.failure)
             if sure[i] or not same[i]
         ]
+        return sorted(seen, key=lambda one: -one.confidence)
+
+    def _is_misfit(self, name: str, box: np.ndarray, position: np.ndarray) -> bool:
+        if cut_edges(box[None], self.camera).any():
+            return False
+        return size_misfit(name, box, position, self.camera) > MISFIT

@@ -15,8 +15,8 @@ from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.world import World
 from arm5dof.training.policy import Policy
 
-TILTS = tuple(np.deg2rad(angle) for angle in (0, 10, 20, 30, 40))
-"""From straight down, radians, in the order in which they are tried."""
+TILTS = tuple(np.deg2rad(angle) for angle in (0, 10, 20, 30, 40, -10, -20))
+"""From straight down, radians, in the order in which they are tried; negative ones towards the arm's axis."""
 ASIDE = tuple(np.deg2rad(angle) for angle in (0, -8, 8, -16, 16))
 """A tilted tool points away from the arm's axis, or so far to the side of that, radians: the plane in which an arm
 moves may pass beside its axis."""

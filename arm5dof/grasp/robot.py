@@ -82,6 +82,7 @@ class SimulatedRobot:
         self._model, self._data, self._arm, self._gripper = scene.model, scene.data, scene.arm, scene.gripper
         self._size, self._back_end = (width, height), back_end
         self._renderer: SimulatedCamera | None = None
+        self._image, self._imaged = np.empty(0, np.uint8), np.empty(0)
         self._on_step, self._steps, self._stride = on_step, 0, max(1, round(every / self._model.opt.timestep))
         self._target = self.joints()
         self._fingers = self._data.qpos[self._gripper.qpos].copy()
@@ -116,8 +117,10 @@ class SimulatedRobot:
         """See `Robot`."""
         if self._renderer is None:
             self._renderer = simulated_camera(self._model, CAMERA, *self._size, self._back_end)
-        mujoco.mj_forward(self._model, self._data)
-        return self._renderer.rgb(self._data)
+        if not np.array_equal(self._data.qpos, self._imaged):  # Drawing takes longer than all else.
+            mujoco.mj_forward(self._model, self._data)
+            self._image, self._imaged = self._renderer.rgb(self._data), self._data.qpos.copy()
+        return self._image.copy()
 
     def _count(self, seconds: float) -> int:
         return max(1, round(seconds / self._model.opt.timestep))

@@ -6,6 +6,7 @@ A scene looks as `random_scene` draws it, but for the bins. Paper on the table i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,7 +45,9 @@ DENSITY = 600.0
 ARM_BIT, OBJECT_BIT = 1, 2
 """The arm collides with all but itself, objects with all, table and bins with what moves."""
 STILL = 0.01
-"""What moves slower is at rest, m/s and rad/s."""
+"""A joint that moves slower is at rest, m/s and rad/s."""
+MOMENTS, STILL_OBJECT = 0.2, (0.001, 0.01)
+"""An object rests if in so many seconds it moves and turns less fast than that, m/s and rad/s, on average."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,10 @@ class TabletopScene(Scene):
 
     def object_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions (n, 3), metres, and rotations (n, 3, 3) of the objects' frames in the base frame, now."""
-        qpos = self.data.qpos[self._joints(self.model.jnt_qposadr)[:, None] + np.arange(7)]
+        return self._poses(self.data)
+
+    def _poses(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        qpos = data.qpos[self._joints(self.model.jnt_qposadr)[:, None] + np.arange(7)]
         rotations = np.empty((len(qpos), 9))
         for rotation, quaternion in zip(rotations, qpos[:, 3:], strict=True):
             mujoco.mju_quat2Mat(rotation, quaternion)
@@ -94,9 +100,13 @@ class TabletopScene(Scene):
         return self.object_poses()[0][:, 2] - self.start[:, 2] >= height
 
     def resting(self) -> np.ndarray:
-        """Which objects are at rest, (n,) bool."""
-        qvel = self.data.qvel[self._joints(self.model.jnt_dofadr)[:, None] + np.arange(6)]
-        return np.abs(qvel).max(-1, initial=0) < STILL
+        """Which objects are at rest, (n,) bool: those that hardly move in the next moments, since contacts tremble."""
+        later, before = copy(self.data), self.object_poses()
+        mujoco.mj_step(self.model, later, round(MOMENTS / self.model.opt.timestep))
+        after = self._poses(later)
+        moved = np.linalg.norm(after[0] - before[0], axis=-1)
+        turned = np.linalg.norm(after[1] - before[1], axis=(-2, -1)) / np.sqrt(2)  # For small angles.
+        return (moved < MOMENTS * STILL_OBJECT[0]) & (turned < MOMENTS * STILL_OBJECT[1])
 
     def in_bin(self, name: str) -> np.ndarray:
         """Which objects are at rest in a bin, (n,) bool.

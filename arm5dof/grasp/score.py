@@ -39,7 +39,14 @@ class Trial:
     """What the program said of why it did not do it."""
 
 
-LOST_BY = {"see": "missed", "locate": "missed", "reach": "policy", "collide": "collision", "place": "place"}
+LOST_BY = {
+    "see": "missed",
+    "locate": "missed",
+    "reach": "policy",
+    "collide": "collision",
+    "rest": "collision",
+    "place": "place",
+}
 """By the stage at which a request ended, where that is all that is known."""
 LOST = ("missed", "wrong class", "localization", "policy", "collision", "grip", "place")
 """Where requests are lost."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import mujoco
@@ -11,10 +12,10 @@ import numpy as np
 from arm5dof.arm import Arm
 from arm5dof.errors import UserError
 from arm5dof.grasp.bins import Bin
-from arm5dof.grasp.gripper import Gripper
+from arm5dof.grasp.gripper import SITE, Gripper
 from arm5dof.grasp.perception import SeenObject
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.objects import CATALOGUE
+from arm5dof.vision.objects import CATALOGUE, CatalogueObject
 
 STEP = 0.04
 """How finely motions are checked: the largest turn of a joint between one pose and the next, radians."""
@@ -25,6 +26,15 @@ ROOM = (0.08, 0.28)
 ARM, OTHERS = 1, 2
 
 
+@dataclass(frozen=True, eq=False)
+class Held:
+    """An object in the gripper."""
+
+    kind: CatalogueObject
+    joints: np.ndarray
+    """Where the arm was when it took it, upright, (dof,), radians."""
+
+
 class World:
     """The arm, the table, bins, and objects as upright cylinders.
 
@@ -32,15 +42,20 @@ class World:
         arm: The arm, from a file, with a gripper.
         bins: What stands on the table.
         objects: What was seen there, with positions.
+        held: What the gripper holds, which goes where that goes.
     """
 
-    def __init__(self, arm: Arm, bins: Iterable[Bin] = (), objects: Sequence[SeenObject] = ()) -> None:
+    def __init__(
+        self, arm: Arm, bins: Iterable[Bin] = (), objects: Sequence[SeenObject] = (), held: Held | None = None
+    ) -> None:
         if arm.mj_spec is None:
             raise UserError("the planner needs the arm's MJCF file, not its compiled model alone")
         spec = arm.mj_spec.copy()
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         for geom in spec.geoms:
             geom.contype, geom.conaffinity, geom.margin, geom.gap = ARM, 0, 0, 0
+        if held is not None:
+            _add_held(spec, arm, held)
         around = [spec.worldbody.add_geom(name="known table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1])]
         for one in bins:
             around += one.add_to(spec)
@@ -111,6 +126,24 @@ class World:
         if without is not None:
             deep &= ~(data.contact.geom == self._objects[without]).any(1)
         return not deep.any()
+
+
+def _add_held(spec: mujoco.MjSpec, arm: Arm, held: Held) -> None:
+    """Add what is held to the body of the gripper's site, as an upright cylinder at the time it was taken."""
+    model, site = arm.mj_model, arm.mj_model.site(SITE).id
+    data = mujoco.MjData(model)
+    data.qpos[arm.qpos] = held.joints
+    mujoco.mj_kinematics(model, data)
+    hand = model.site_bodyid[site]
+    to_hand, quaternion = data.xmat[hand].reshape(3, 3).T, np.empty(4)
+    mujoco.mju_quatZ2Vec(quaternion, to_hand[:, 2].copy())
+    geom = spec.site(SITE).parent.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[held.kind.radius, held.kind.half_height, 0],
+        pos=to_hand @ (data.site_xpos[site] - data.xpos[hand]),
+        quat=quaternion,
+    )
+    geom.contype, geom.conaffinity, geom.margin, geom.gap = ARM, 0, 0, 0
 
 
 def dense(path: np.ndarray) -> np.ndarray:

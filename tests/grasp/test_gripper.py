@@ -6,8 +6,9 @@ import pytest
 
 from arm5dof.arm import load_arm
 from arm5dof.errors import UserError
-from arm5dof.grasp.gripper import Gripper
+from arm5dof.grasp.gripper import Gripper, least_width
 from arm5dof.runtime import files
+from arm5dof.vision.objects import CATALOGUE
 
 HAND = """<mujoco><worldbody><body name="hand"><joint name="swivel"/><geom size="0.01"/><site name="grasp"/>{}</body>
 </worldbody><actuator>{}</actuator></mujoco>"""
@@ -23,6 +24,14 @@ def hand(*axes, joint=SLIDE, servoed=2, ys=(0.01, -0.01)):
     return mujoco.MjModel.from_xml_string(
         HAND.format("".join(fingers), "".join(servos)).replace("<mujoco>", '<mujoco><compiler autolimits="true"/>')
     )
+
+
+def test_the_least_widths_of_objects():
+    """By their shapes: a cube's side, a ball's diameter, a brick's short side, a dumbbell's bar."""
+    found = {one.name: 1e3 * least_width(one) for one in CATALOGUE}
+    known = {"red cube": 25, "blue cube": 25, "ball": 30, "can": 25, "brick": 20, "ring": 40, "dumbbell": 10}
+    assert {name: found[name] for name in known} == pytest.approx(known, abs=0.1)
+    assert found["cross"] == pytest.approx(2 * 7 * 2**0.5, abs=0.1)  # Across, between its arms.
 
 
 @pytest.mark.parametrize("name", ["arm5.xml", "arm7_gripper.xml"])

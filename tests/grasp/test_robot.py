@@ -68,7 +68,13 @@ def test_it_goes_where_it_is_told_and_says_where_it_is():
     for opening in (0.05, 0.01):
         robot.grip(opening)
         assert robot.opening() == pytest.approx(opening, abs=1e-3)
-    assert robot.image().shape == (480, 640, 3) and robot.image().dtype == np.uint8
+    image = robot.image()
+    assert image.shape == (480, 640, 3) and image.dtype == np.uint8
+    first = image.copy()
+    image[:] = 0
+    np.testing.assert_array_equal(robot.image(), first)  # Nothing has moved.
+    robot.move([0.5], [UP])
+    assert (robot.image() != first).any()
 
 
 def test_bad_trajectories_are_refused():

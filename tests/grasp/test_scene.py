@@ -101,6 +101,18 @@ def test_two_cubes_can_be_stacked():
     assert scene.resting().all()
 
 
+def test_what_trembles_rests_and_what_rolls_does_not():
+    bricks = [Placement(CLASS_NAMES.index("brick"), np.array([0.2, 0.0, 0.01 + 0.02 * k]), 0.3 * k) for k in range(3)]
+    scene = tabletop_scene(0, objects=[*bricks, placed("ball", 0.15, 0.1)], start=UP, distractors=False)
+    stepped(scene, 1.0)
+    time, before = scene.data.time, scene.data.qpos.copy()
+    assert scene.resting().all()
+    np.testing.assert_array_equal(scene.data.qpos, before)
+    assert scene.data.time == time, "looking moves nothing"
+    scene.data.qvel[scene.model.body("object 3").dofadr[0]] = 0.02
+    assert scene.resting().tolist() == [True, True, True, False]
+
+
 def test_bins_hold_what_is_dropped_into_them():
     scene = tabletop_scene(0, objects=[placed(name, 0.2, 0.0) for name in CLASS_NAMES], start=UP, distractors=False)
     assert list(scene.bins) == list(CLASS_NAMES)

@@ -14,7 +14,7 @@ from arm5dof.errors import UserError
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.perception import SeenObject
 from arm5dof.grasp.scene import ARM_BIT, TabletopScene, tabletop_scene
-from arm5dof.grasp.world import ROOM, STEP, World, dense
+from arm5dof.grasp.world import ROOM, STEP, Held, World, dense
 from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
 from arm5dof.vision.rendering.simulated import simulated_camera
 from arm5dof.vision.synthetic.scene_builder import CAMERA
@@ -95,6 +95,27 @@ def test_paths_are_checked_all_the_way():
             assert not world.clear(path, 0.02)
             blocked += 1
     assert clear > 2 and blocked > 2
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_what_is_held_must_not_hit_the_table(name):
+    """Against the lowest point of an upright can that was taken with the tool pointing aside, by geometry."""
+    arm, rng = gripping_arm(name), np.random.default_rng(2)
+    taken = rng.uniform(arm.lower, arm.upper)
+    _, at_first = map(np.asarray, arm.pose(taken))
+    free, world = World(arm), World(arm, held=Held(CAN, taken))
+    clear, blocked = 0, 0
+    for q in rng.uniform(arm.lower, arm.upper, (600, arm.dof)):
+        if not free.clear(q[None], 0.03):
+            assert not world.clear(q[None], 0.03)
+            continue
+        position, rotation = map(np.asarray, arm.pose(q))
+        upright = np.clip((rotation @ at_first.T)[2, 2], -1, 1)
+        lowest = position[2] - CAN.half_height * abs(upright) - CAN.radius * np.sqrt(1 - upright**2)
+        if abs(lowest) > 1e-4:
+            assert world.clear(q[None], 0.03) == (lowest > 0)
+            clear, blocked = clear + (lowest > 0), blocked + (lowest < 0)
+    assert clear > 50 and blocked > 3
 
 
 def test_dense_paths_keep_their_poses_and_take_small_steps():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ MAX_PROPOSALS = 40
 PROPOSAL_THRESHOLD, PROPOSAL_FLOOR = 0.07, 0.01
 """Less likely proposals are not refined, but with test-time augmentation, or where they fill up a batch of the refiner:
 those below the second never."""
+CUT = 2
+"""What comes as near to an edge of a window inside the image is cut by it, pixels."""
 PROPOSAL_IOU = 0.6
 """Of proposals that overlap more, the likeliest is refined."""
 PROPOSER_WEIGHT = 0.4
@@ -50,24 +53,32 @@ class TabletopDetector:
         iou: Of boxes that overlap more the best stays, in [0, 1], whatever their classes: an object is of one class.
         tta: Test-time augmentation: refine less likely proposals too, and what may be an object three times, once
             mirrored, and average. More is found, and boxes fit better, in twice the time.
+        windows: Look for objects in four windows of the image too, in which they are larger. More is found, and more
+            that is no object.
 
     Raises:
         UserError: The file is missing, damaged or of another network, or a threshold lies outside [0, 1].
     """
 
     def __init__(
-        self, weights: str | Path | None = None, confidence: float = 0.25, iou: float = 0.6, tta: bool = False
+        self,
+        weights: str | Path | None = None,
+        confidence: float = 0.25,
+        iou: float = 0.6,
+        tta: bool = False,
+        windows: bool = False,
     ) -> None:
         check_thresholds(confidence, iou)
         params, self.class_names = load_weights(weights)
         self._params = jax.device_put(params)
         self._confidence, self._iou, self._tta = confidence, iou, tta
+        self._propose = propose_in_windows if windows else propose
 
     def __call__(self, image: np.ndarray) -> Detections:
         """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
         boxed = letterbox(rgb(image), INPUT_SIZE)
         refine_here = partial(refine, self._params["refiner"], boxed.image)
-        proposed, objectness = propose(self._params["proposer"], boxed.image)
+        proposed, objectness = self._propose(self._params["proposer"], boxed.image)
         if not self._tta:
             count = _whole_batches(int(np.count_nonzero(objectness >= PROPOSAL_THRESHOLD)))
             proposed, objectness = proposed[:count], objectness[:count]
@@ -110,6 +121,27 @@ def propose(params: dict[str, Any], image: np.ndarray, floor: float = PROPOSAL_F
     boxes, logits = (np.asarray(x) for x in _proposer()(params, reduced))
     rows = np.flatnonzero(logits > np.log(floor / (1 - floor)))
     boxes, objectness = boxes[rows] * (image.shape[1] / PROPOSER_SIZE[0]), 1 / (1 + np.exp(-logits[rows]))
+    return _likeliest(boxes, objectness)
+
+
+def propose_in_windows(params: dict[str, Any], image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `propose`, in the image and in four windows of it that overlap. What an edge of a window cuts is left out."""
+    full = np.array([image.shape[1], image.shape[0]])
+    size = 2 * full // 3
+    found = [propose(params, image)]
+    for corner in product(*zip((0, 0), full - size, strict=True)):
+        start, end = np.array(corner), corner + size
+        boxes, objectness = propose(params, image[start[1] : end[1], start[0] : end[0]])
+        boxes = boxes + np.tile(start, 2)
+        whole = (boxes[:, :2] >= np.where(start > 0, start + CUT, -np.inf)) & (
+            boxes[:, 2:] <= np.where(end < full, end - CUT, np.inf)
+        )
+        found.append((boxes[whole.all(1)], objectness[whole.all(1)]))
+    boxes, objectness = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return _likeliest(boxes, objectness)
+
+
+def _likeliest(boxes: np.ndarray, objectness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     kept = nms(boxes, objectness, PROPOSAL_IOU)[:MAX_PROPOSALS]
     return boxes[kept], objectness[kept]
 

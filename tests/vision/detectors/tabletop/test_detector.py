@@ -8,7 +8,15 @@ from helpers.tabletop_weights import weights_of, zeros
 from arm5dof.errors import UserError
 from arm5dof.vision.boxes import iou
 from arm5dof.vision.detectors.loading import load_detector
-from arm5dof.vision.detectors.tabletop.detector import MAX_PROPOSALS, PROPOSER_WEIGHT, TabletopDetector, propose, refine
+from arm5dof.vision.detectors.tabletop import detector as tabletop_detector
+from arm5dof.vision.detectors.tabletop.detector import (
+    MAX_PROPOSALS,
+    PROPOSER_WEIGHT,
+    TabletopDetector,
+    propose,
+    propose_in_windows,
+    refine,
+)
 from arm5dof.vision.detectors.tabletop.weights import save_weights
 from arm5dof.vision.synthetic.samples import render_samples
 
@@ -100,6 +108,34 @@ def test_augmentation_finds_no_less_and_its_boxes_fit_better():
     once, thrice = np.array(fits)
     assert len(once) > 10 and np.sum(thrice > 0.5) >= np.sum(once > 0.5) > 0.9 * len(once)
     assert np.median(thrice) > np.median(once) > 0.9
+
+
+def test_windows_propose_what_the_whole_image_does_and_more(monkeypatch):
+    """Where one may look at all that is proposed."""
+    monkeypatch.setattr(tabletop_detector, "MAX_PROPOSALS", 400)
+    params = load_detector()._params["proposer"]
+    more = 0
+    for sample in render_samples(7, 3, "evaluation", "software", 2):
+        whole, _ = propose(params, sample.image)
+        boxes, objectness = propose_in_windows(params, sample.image)
+        assert (np.diff(objectness) <= 0).all()
+        assert (boxes[:, 2:] > boxes[:, :2]).all() and boxes.min() > -30 and boxes.max() < 670
+        # One that overlaps is as good.
+        assert (iou(whole[:, None], boxes).max(1) > 0.6).all()
+        more += len(boxes) - len(whole)
+    assert more > 0
+
+
+def test_windows_show_where_things_are(monkeypatch):
+    """A proposer that finds one box, in the middle of what it is shown."""
+    middle = lambda params, image: (
+        np.array([[0.4, 0.4, 0.6, 0.6]]) * np.tile([image.shape[1], image.shape[0]], 2),
+        np.array([0.5]),
+    )
+    monkeypatch.setattr(tabletop_detector, "propose", middle)
+    boxes, _ = propose_in_windows({}, np.zeros((480, 640, 3), np.uint8))
+    centers = sorted(map(tuple, ((boxes[:, :2] + boxes[:, 2:]) / 2).round(1)))
+    assert centers == [(213.0, 160.0), (213.0, 320.0), (320.0, 240.0), (427.0, 160.0), (427.0, 320.0)]
 
 
 def test_only_augmentation_refines_the_unlikely(tmp_path):
