@@ -150,25 +150,24 @@ def _photograph(args: argparse.Namespace, policy: Path) -> int:
     from arm5dof.arm import load_arm
     from arm5dof.grasp.grasper import Grasper
     from arm5dof.grasp.gripper import SITE
-    from arm5dof.grasp.perception import CameraPerception
+    from arm5dof.grasp.perception import CameraPerception, detectors
     from arm5dof.grasp.planner import Planner
     from arm5dof.grasp.robot import DryRun
     from arm5dof.grasp.world import World
     from arm5dof.training.policy_file import load_policy
     from arm5dof.vision import images
     from arm5dof.vision.camera import Camera
-    from arm5dof.vision.detectors.loading import load_detector
 
     if args.pick is None:
         raise UserError("--image wants --pick CLASS: what is to be picked")
     camera = Camera.load(args.camera)
-    perception = CameraPerception(load_detector(), camera)
+    quick, thorough = (CameraPerception(detector, camera) for detector in detectors())
     image = images.read(args.image)
     arm = load_arm(args.arm, SITE)
     planner = Planner(load_policy(policy), arm)
     rest = World(arm).rest(camera)
     robot = DryRun(arm, rest, image=image)
-    grasper = Grasper(robot, perception, planner, rest)
+    grasper = Grasper(robot, quick, planner, rest, second_look=thorough)
     outcome = grasper.pick(args.pick)
     if outcome.success and args.place:
         import numpy as np

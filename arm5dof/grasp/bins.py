@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision.objects import CatalogueObject
 
 FAR, NEAR = 0.03, 0.12
 """How much nearer to the arm's axis than the furthest objects the bins stand, metres: in both rows the tool can point
@@ -25,6 +26,13 @@ HALF, WALL, HEIGHT = 0.035, 0.002, 0.02
 turned, and a gripper that holds its center 20 mm above where it will lie opens above the walls."""
 COLOR = (0.1, 0.1, 0.11, 1.0)
 """Nearly black: the walls of a lighter bin are easily taken for bricks."""
+DROP = 0.003
+"""Above where it will rest an object is let go, metres."""
+FINGERTIPS = 0.011
+"""How far below what they hold fingers reach, and a little, metres: they open above the walls."""
+BESIDE_WALL = 0.85
+"""How far from the middle an object comes into a corner, of how far it could: what slipped a little between the fingers
+does not come down on a wall."""
 PILED = 0.06
 """The center of an object that lies on others in a bin is no higher, metres."""
 
@@ -50,6 +58,33 @@ class Bin:
         along = np.array([np.cos(self.yaw), np.sin(self.yaw)])
         local = (points[:, :2] - self.position) @ np.stack([along, [-along[1], along[0]]], -1)
         return (np.abs(local).max(-1) < HALF - WALL) & (points[:, 2] < PILED)
+
+    def contains_seen(self, point: np.ndarray, eye: np.ndarray | None = None) -> bool:
+        """Whether what is seen at a point (3,), metres, base frame, lies in the bin.
+
+        Args:
+            point: Where it is if it lies on the table.
+            eye: Where it is seen from, (3,), if it may lie on other objects in the bin: it is nearer to that then.
+        """
+        if eye is None or eye[2] <= PILED:
+            return bool(self.contains(np.append(point[:2], 0.0)[None])[0])
+        share = np.linspace(0, (PILED - point[2]) / (eye[2] - point[2]), 10, endpoint=False)[:, None]
+        return bool(self.contains(point + share * (eye - point)).any())
+
+    def spot(self, kind: CatalogueObject, count: int) -> tuple[np.ndarray, float]:
+        """Where an object is let go that comes after `count` others of its class: in one corner after the other,
+        opposite ones first; or, where two would not fit in opposite corners, on top of each other.
+
+        Returns:
+            Place of its center, (2,), and how high that is, metres, base frame.
+        """
+        lowest = max(kind.half_height + DROP, HEIGHT + FINGERTIPS)
+        aside = BESIDE_WALL * (self.room - kind.radius)
+        if kind.radius > 2**0.5 * aside:
+            return self.position, max(lowest, kind.half_height * (2 * count + 1) + DROP)
+        along = np.array([np.cos(self.yaw), np.sin(self.yaw)])
+        corner = np.array([(1, 1), (-1, -1), (1, -1), (-1, 1)][count % 4])
+        return self.position + aside * corner @ np.stack([along, [-along[1], along[0]]]), lowest
 
     def add_to(self, spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
         """Add the body `bin NAME` to a spec: four walls, which are returned, and a floor that is only seen."""

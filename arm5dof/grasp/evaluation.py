@@ -21,7 +21,7 @@ from arm5dof.grasp.grasper import Grasper, checked_place
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.ground_truth import TrueBoxes, TruePositions, in_sight
 from arm5dof.grasp.jobs import CLASS, Step, perform
-from arm5dof.grasp.perception import CameraPerception, Perception
+from arm5dof.grasp.perception import CameraPerception, Perception, detectors
 from arm5dof.grasp.planner import Planner
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import UNDISTURBED, Disturbance, TabletopScene, tabletop_scene
@@ -29,8 +29,6 @@ from arm5dof.grasp.score import LOST_BY, Score, Trial, is_met, is_put, lost_by
 from arm5dof.grasp.world import World
 from arm5dof.runtime import xla
 from arm5dof.training.policy_file import load_policy
-from arm5dof.vision.detectors.loading import load_detector
-from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 from arm5dof.vision.objects import CLASS_NAMES
 from arm5dof.vision.synthetic.scenes import MAX_AZIMUTH, MAX_OBJECTS
 
@@ -47,8 +45,6 @@ HOLD = 2.0
 """Seconds for which an object must be held."""
 LIFT = 0.05
 """Metres by which it must be lifted."""
-FAINT = 0.07
-"""What is seen with less confidence at the second look is not told."""
 ROOM, HEIGHT = 0.06, 0.02
 """To put something down is for a place from which all else is so far, and which the arm reaches at such a height,
 metres."""
@@ -135,8 +131,7 @@ class Program:
         self.setting = setting
         self.planner = Planner(load_policy(setting.policy), load_arm(setting.arm, SITE))
         self._empty = World(self.planner.arm)
-        second = partial(TabletopDetector, confidence=FAINT, iou=0.45, tta=True, windows=True)
-        self.detectors = [load_detector(), second()] if setting.eyes == "camera" else []
+        self.detectors = detectors() if setting.eyes == "camera" else ()
 
     def scene(self, number: int) -> TabletopScene:
         """A random scene, the arm at rest out of the camera's way."""

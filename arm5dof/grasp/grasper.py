@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from arm5dof.errors import UserError
-from arm5dof.grasp.bins import HEIGHT as BIN_HEIGHT
-from arm5dof.grasp.bins import PILED, Bin
+from arm5dof.grasp.bins import DROP, Bin
 from arm5dof.grasp.driver import Driver
 from arm5dof.grasp.gripper import Gripper, least_width
 from arm5dof.grasp.outcome import Outcome, Stage
@@ -29,19 +28,12 @@ does not count."""
 DOUBT = 0.6
 """Of less confidence, what is seen is taken for an obstacle at the first attempt only."""
 ATTEMPTS = 3
-"""From as many images."""
+"""At most, each from a new image."""
 PLACED, MISPLACED = 0.006, 0.010
 """What is seen further from where it should lie, metres, is picked and put there again, since a gripper does not know
 where along its fingers it holds an object; and what is seen further is not done."""
 BESIDE = 0.06
 """What was just put down is seen no further away, metres."""
-DROP = 0.003
-"""Above where it will rest an object is let go, metres."""
-BESIDE_WALL = 0.85
-"""How far from a bin's middle an object comes into a corner, of how far it could: what slipped a little between the
-fingers does not come down on a wall."""
-FINGERTIPS = 0.011
-"""How far below what they hold fingers reach, and a little, metres: they open above a bin's walls."""
 NARROWER, WIDER = 0.002, 0.004
 """What is held may be so much narrower or wider than its class, metres."""
 LEAST = 0.002
@@ -109,16 +101,12 @@ class Grasper:
         self._say("look again" if again else "look")
         perception = self._second if again and self._second is not None else self.perception
         seen = perception(self.robot.image())
-        return [one for one in seen if one.position is None or not any(self._in(b, one) for b in self.bins.values())]
+        return [one for one in seen if one.position is None or not self._in_a_bin(one.position, one.eye)]
 
-    def _in(self, bin: Bin, seen: SeenObject) -> bool:
-        """Whether it lies in a bin, or on what was put there, which shows it further from the camera than it is."""
-        assert seen.position is not None
-        low = seen.position
-        if bin.name not in self._filled or seen.eye is None or seen.eye[2] <= PILED:
-            return bool(bin.contains(np.append(low[:2], 0.0)[None])[0])
-        share = np.linspace(0, (PILED - low[2]) / (seen.eye[2] - low[2]), 10, endpoint=False)[:, None]
-        return bool(bin.contains(low + share * (seen.eye - low)).any())
+    def _in_a_bin(self, position: np.ndarray, eye: np.ndarray | None) -> bool:
+        return any(
+            bin.contains_seen(position, eye if name in self._filled else None) for name, bin in self.bins.items()
+        )
 
     def pick(self, name: str, doubtful: bool = False) -> Outcome:
         """Pick up an object of a class and hold it, `CLEARANCE` above where it was.
@@ -177,10 +165,10 @@ class Grasper:
             below = next((one for one in self._driver.objects if one.name == on), None)
             if below is None:
                 return Outcome("see", f"no {on} is seen to put it on")
-            assert below.position is not None
-            where, height = below.position[:2], 2 * below.position[2] + kind.half_height + DROP
+            where, height = _spot(below)[:2], 2 * _spot(below)[2] + kind.half_height + DROP
         elif bin is not None:
-            where, height = self._free(self.bins[bin], kind)
+            count = self._filled[bin] = self._filled.get(bin, -1) + 1
+            where, height = self.bins[bin].spot(kind, count)
         else:
             assert point is not None
             return self._put_exactly(checked_place(point), kind)
@@ -192,41 +180,26 @@ class Grasper:
         for attempt in range(1, ATTEMPTS + 1):
             outcome = self._put(where, kind.half_height + DROP)
             found = self._beside(where, kind.name, before) if outcome.success else None
-            if found is None or _away(found, where) <= PLACED:
+            off = 0.0 if found is None else _away(found, where)
+            if found is None or off <= PLACED:
                 return outcome
-            off = f"it lies {1e3 * _away(found, where):.0f} mm from the place"
-            if attempt == ATTEMPTS:
-                break
-            again = self._attempt(kind.name, 1, self.look(), found)
+            again = self._attempt(kind.name, 1, self.look(), found) if attempt < ATTEMPTS else outcome
             if not again.success:
-                off = f"{off}, and {again.reason}"
                 break
-        return Outcome("place", off) if _away(found, where) > MISPLACED else outcome
+        if off <= MISPLACED:
+            return outcome
+        also = "" if again.success else f", and {again.reason}"
+        return Outcome("place", f"it lies {1e3 * off:.0f} mm from the place{also}")
 
     def _beside(self, where: np.ndarray, name: str, before: Sequence[SeenObject]) -> SeenObject | None:
         """What of a class is seen nearest to a place, unless it is too far from it to be what was put there, or was
         seen there before."""
         seen = [one for one in self.look() if one.name == name and one.position is not None]
         new = [
-            one
-            for one in seen
-            if _away(one, where) <= SAME or all(_away(one, old.position[:2]) > SAME for old in before)
+            one for one in seen if _away(one, where) <= SAME or all(_away(one, _spot(old)[:2]) > SAME for old in before)
         ]
         nearest = min(new, key=lambda one: _away(one, where), default=None)
         return nearest if nearest is not None and _away(nearest, where) <= BESIDE else None
-
-    def _free(self, bin: Bin, kind: CatalogueObject) -> tuple[np.ndarray, float]:
-        """Where in a bin, and how high, what is held is let go: in one corner after the other, opposite ones first; or,
-        where two would not fit in opposite corners, on top of each other."""
-        count = self._filled[bin.name] = self._filled.get(bin.name, -1) + 1
-        lowest = max(kind.half_height + DROP, BIN_HEIGHT + FINGERTIPS)
-        aside = BESIDE_WALL * (bin.room - kind.radius)
-        if kind.radius > 2**0.5 * aside:
-            pile = kind.half_height * (2 * count + 1) + DROP
-            return bin.position, max(lowest, pile)
-        along = np.array([np.cos(bin.yaw), np.sin(bin.yaw)])
-        corner = np.array([(1, 1), (-1, -1), (1, -1), (-1, 1)][count % 4])
-        return bin.position + aside * corner @ np.stack([along, [-along[1], along[0]]]), lowest
 
     def put_back(self) -> Outcome:
         """Put down what is held where it was picked up, and go to rest."""
@@ -258,7 +231,7 @@ class Grasper:
         wanted = [one for one in seen if one.name == name and not self._is_nothing(one)]
         located = [one for one in wanted if one.position is not None]
         if near is not None:
-            located = sorted(located, key=lambda one: _away(one, near.position[:2]))[:1]
+            located = sorted(located, key=lambda one: _away(one, _spot(near)[:2]))[:1]
         located.sort(key=self._failed_at)  # Where one failed is tried after the others.
         if not wanted:
             return Outcome("see", f"no {name} is seen", attempt)
@@ -267,23 +240,23 @@ class Grasper:
         kind = next(one for one in CATALOGUE if one.name == name)
         outcome = Outcome("reach")
         for target in located:
-            assert target.position is not None
+            spot = _spot(target)
             # Where everything would collide, the doubtful may not be there.
             doubt = 0.0 if attempt == 1 else DOUBT
             self._driver.objects = [
                 one for one in seen if one.position is not None and (one.confidence >= doubt or one is target)
             ]
-            self._say(f"plan: {name} at {1e3 * target.position[0]:.0f} {1e3 * target.position[1]:.0f} mm")
+            self._say(f"plan: {name} at {1e3 * spot[0]:.0f} {1e3 * spot[1]:.0f} mm")
             opening = min(2 * kind.radius + SLACK, self._widest)
-            way = self._driver.approach(target.position, opening, target, self._met)
+            way = self._driver.approach(spot, opening, target, self._met)
             if not isinstance(way, str):
                 return self._grasp(way, target, kind, opening, attempt)
             stage: Stage = "reach" if way == "out of reach" else "collide"
-            outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, target.position)
+            outcome = Outcome(stage, f"the {name} is there, but {way}", attempt, spot)
         return outcome
 
     def _failed_at(self, seen: SeenObject) -> bool:
-        return any(np.linalg.norm(seen.position - other) < SAME for other in self._failed)
+        return any(np.linalg.norm(_spot(seen) - other) < SAME for other in self._failed)
 
     def _is_nothing(self, seen: SeenObject) -> bool:
         """Whether the fingers closed there on nothing, and it is doubtful too."""
@@ -292,7 +265,7 @@ class Grasper:
         return any(np.linalg.norm(seen.position - other) < SAME for other in self._nothing)
 
     def _grasp(self, way: Approach, target: SeenObject, kind: CatalogueObject, opening: float, attempt: int) -> Outcome:
-        assert target.position is not None
+        spot = _spot(target)
         self._say(f"grasp the {target.name}")
         self.robot.grip(opening)
         if not self._driver.go(way):
@@ -300,7 +273,7 @@ class Grasper:
             return self._give_up("collide", "the arm met something on the way", way, attempt, target)
         self.robot.grip(-SQUEEZE)
         if self.robot.opening() < LEAST:
-            self._nothing.append(target.position)
+            self._nothing.append(spot)
             return self._give_up("grip", "the fingers closed on nothing", way, attempt, target)
         if not least_width(kind) - NARROWER <= self.robot.opening() <= 2 * kind.radius + WIDER:
             self._met.append(way.direction)
@@ -312,15 +285,15 @@ class Grasper:
         self._seen_before = [one for one in self._driver.objects if one.name == target.name]
         self._driver.objects.remove(target)
         self._driver.held = Held(kind, way.line[-1])
-        self._from, self._met = target.position[:2], []
-        return Outcome("done", attempts=attempt, position=target.position)
+        self._from, self._met = spot[:2], []
+        return Outcome("done", attempts=attempt, position=spot)
 
     def _give_up(
         self, stage: Stage, reason: str, way: Approach, attempt: int = 1, target: SeenObject | None = None
     ) -> Outcome:
         self._say(f"give up: {reason}")
         if target is not None:
-            self._failed.append(target.position)
+            self._failed.append(_spot(target))
         self._driver.held = None
         self.robot.grip(min(max(self._widest / 2, self.robot.opening() + SLACK), self._widest))
         self._driver.retreat(way)
@@ -335,10 +308,15 @@ class Grasper:
         return replace(outcome, stage="rest", reason=reason)
 
 
+def _spot(seen: SeenObject) -> np.ndarray:
+    """Where something that could be located is, (3,), metres."""
+    assert seen.position is not None
+    return seen.position
+
+
 def _away(seen: SeenObject, where: np.ndarray) -> float:
     """How far from a place on the table something is seen, metres."""
-    assert seen.position is not None
-    return float(np.hypot(*(seen.position[:2] - where)))
+    return float(np.hypot(*(_spot(seen)[:2] - where)))
 
 
 def checked_place(point: np.ndarray | Sequence[float]) -> np.ndarray:

@@ -25,7 +25,7 @@ class Outcome:
     reason: str = ""
     """In words, for people."""
     attempts: int = 1
-    """How many images were taken."""
+    """How often it was tried."""
     position: np.ndarray | None = field(default=None, repr=False)
     """Where the object was thought to be, (3,), metres, base frame."""
 

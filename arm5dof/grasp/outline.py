@@ -49,17 +49,19 @@ def _surface(index: int) -> np.ndarray:
 
 
 def _points(part: Part) -> np.ndarray:
-    if part.kind == BOX:
-        points = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T * part.size
-    elif part.kind == CYLINDER:
-        angles = np.linspace(0, 2 * np.pi, ROUND // 4, endpoint=False)
-        rim = part.size[0] * np.stack([np.cos(angles), np.sin(angles)], 1)
-        points = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-part.size[1], part.size[1])])
-    else:
-        k = np.arange(ROUND) + 0.5  # Fibonacci's lattice.
-        height, angles = 1 - 2 * k / ROUND, np.pi * (1 + 5**0.5) * k
-        ring = np.sqrt(1 - height**2)
-        points = part.size[0] * np.stack([ring * np.cos(angles), ring * np.sin(angles), height], 1)
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, part.quaternion)
-    return points @ rotation.reshape(3, 3).T + part.position
+    return _upright(part) @ rotation.reshape(3, 3).T + part.position
+
+
+def _upright(part: Part) -> np.ndarray:
+    if part.kind == BOX:
+        return np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T * part.size
+    if part.kind == CYLINDER:
+        angles = np.linspace(0, 2 * np.pi, ROUND // 4, endpoint=False)
+        rim = part.size[0] * np.stack([np.cos(angles), np.sin(angles)], 1)
+        return np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-part.size[1], part.size[1])])
+    k: np.ndarray = np.arange(ROUND) + 0.5  # Fibonacci's lattice.
+    height, angles = 1 - 2 * k / ROUND, np.pi * (1 + 5**0.5) * k
+    ring = np.sqrt(1 - height**2)
+    return part.size[0] * np.stack([ring * np.cos(angles), ring * np.sin(angles), height], 1)

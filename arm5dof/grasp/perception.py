@@ -12,6 +12,8 @@ from arm5dof.grasp.outline import size_misfit
 from arm5dof.vision.boxes import iou
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detector
+from arm5dof.vision.detectors.loading import load_detector
+from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 from arm5dof.vision.localization.common import cut_edges
 from arm5dof.vision.localization.solids import CATALOGUE_SOLIDS
 from arm5dof.vision.localization.table_plane import by_plane
@@ -36,6 +38,8 @@ class SeenObject:
     nearer to that."""
 
 
+FAINT = 0.07
+"""What is seen with less confidence at a second look is not told."""
 SURE = 0.25
 """Of less confidence, something counts only where nothing more certain is."""
 MISFIT, UNLIKE = 0.2, 0.1
@@ -46,6 +50,11 @@ SAME = 0.3
 
 Perception = Callable[[np.ndarray], list[SeenObject]]
 """From an RGB image (h, w, 3) uint8 to what is seen in it, the surest first."""
+
+
+def detectors() -> tuple[Detector, Detector]:
+    """The detector that ships, for a quick look; and for a second one, slower, that shows what is faint too."""
+    return load_detector(), TabletopDetector(confidence=FAINT, iou=0.45, tta=True, windows=True)
 
 
 class CameraPerception:

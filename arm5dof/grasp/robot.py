@@ -23,8 +23,8 @@ FINGER_SPEED = 0.05
 """Of each finger, m/s: slow enough that the first to touch an object pushes it along and does not knock it away."""
 PATIENCE = 1.0
 """Seconds to wait for rest after the last target."""
-IMAGINED = 0.01
-"""How wide an object is that a dry run closes on, metres."""
+IMAGINED = 0.008
+"""An object that a dry run closes on is so much narrower than the gripper was opened for it, metres."""
 REST_STEPS = 10
 """Time steps without motion that count as rest."""
 
@@ -171,7 +171,7 @@ class DryRun:
     def __init__(
         self, arm: Arm, joints: np.ndarray | None = None, opening: float = 0.0, image: np.ndarray | None = None
     ) -> None:
-        self._dof, self._image = arm.dof, image
+        self._dof, self._image, self._opened = arm.dof, image, opening
         start = arm.home if joints is None else np.asarray(joints, float)
         self.commands = [Command(0.0, start, opening)]
 
@@ -181,7 +181,8 @@ class DryRun:
 
     def opening(self) -> float:
         """See `Robot`: what it closes on is taken to be there."""
-        return max(self.commands[-1].opening, IMAGINED)
+        now = self.commands[-1].opening
+        return now if now > 0 else max(self._opened - IMAGINED, 0.0)
 
     def move(self, times: np.ndarray, joints: np.ndarray) -> None:
         """See `Robot`."""
@@ -192,6 +193,7 @@ class DryRun:
     def grip(self, opening: float) -> None:
         """See `Robot`."""
         last = self.commands[-1]
+        self._opened = opening if opening > 0 else self._opened
         seconds = abs(opening - last.opening) / 2 / FINGER_SPEED
         self.commands.append(Command(last.time + seconds, last.joints, opening))
 

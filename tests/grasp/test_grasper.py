@@ -74,6 +74,12 @@ class Bench:
         first = self.scene.model.jnt_qposadr[self.scene.model.body(f"object {i}").jntadr[0]]
         return self.scene.data.qpos[first : first + 2]
 
+    def free(self, radius: float) -> np.ndarray:
+        """A place on the table so far from the arm's axis, as far as can be from all objects, (2,)."""
+        angles = np.linspace(-1.4, 1.4, 30)
+        points = radius * np.stack([np.cos(angles), np.sin(angles)], 1)
+        return max(points, key=lambda point: np.linalg.norm(self.scene.start[:, :2] - point, axis=1).min())
+
     def at_rest(self) -> bool:
         return np.abs(self.robot.joints() - self.rest).max() < 0.01 and not self.scene.lifted().any()
 
@@ -111,7 +117,7 @@ def test_a_second_look_finds_what_the_first_does_not():
     five = bench.grasper.robot
     again = Grasper(five, bench.perception, program("truth").planner, bench.rest, second_look=both)
     outcome = again.pick("can")
-    assert outcome.success and outcome.attempts == 2 and bench.held() == {"can"}
+    assert outcome.success and outcome.attempts == 1 and bench.held() == {"can"}
 
 
 def test_what_is_out_of_reach_or_not_located_is_said_to_be():
@@ -140,9 +146,7 @@ def test_it_is_put_into_a_bin(eyes: Eyes):
 @pytest.mark.parametrize("eyes", EYES)
 def test_it_is_put_down_where_it_should_be(eyes: Eyes):
     bench = Bench(2, eyes)
-    near = lambda point: np.linalg.norm(bench.scene.start[:, :2] - point, axis=1).min()
-    angles = np.linspace(-1.4, 1.4, 30)
-    point = max(0.18 * np.stack([np.cos(angles), np.sin(angles)], 1), key=near)
+    point = bench.free(0.18)
     for name in ("red cube", "brick"):
         assert bench.grasper.pick(name).success
         assert bench.grasper.place(point).success
@@ -170,17 +174,20 @@ def test_what_came_to_lie_elsewhere_is_put_there_again():
 
 
 @pytest.mark.parametrize(
-    "x, shift, times, reason",
-    [(0.19, 0.014, 3, "it lies 14 mm from the place"), (0.24, 0.05, 1, "it lies 50 mm from the place, and the can is")],
+    "radius, shift, times, reason",
+    [
+        (0.19, 0.014, 3, "it lies 14 mm from the place"),
+        (0.275, 0.055, 1, "it lies 55 mm from the place, and the can is"),
+    ],
 )
-def test_what_stays_elsewhere_is_not_done(x: float, shift: float, times: int, reason: str):
+def test_what_stays_elsewhere_is_not_done(radius: float, shift: float, times: int, reason: str):
     """It rolls away every time, or to where the arm cannot pick it again."""
-    bench, point = Bench(1, "truth"), np.array([x, 0.02])
-    which = bench.names.index("can")
+    bench = Bench(1, "truth")
+    which, point = bench.names.index("can"), bench.free(radius)
 
     def roll_away(words: str) -> None:
         if words == "look" and "rest" in bench.said:
-            bench.position(which)[:] = [point[0] + shift, point[1]]
+            bench.position(which)[:] = point * (1 + shift / radius)
 
     assert bench.grasper.pick("can").success
     bench.on_stage = roll_away
@@ -208,14 +215,8 @@ def test_where_one_failed_others_are_tried_first():
     """Two of a class are seen, of which the surer one is not there."""
     bench = Bench(4, "truth")
     name = bench.names[0]
-    free = next(
-        np.array([x, y, 0.01])
-        for x in (0.2, 0.15, 0.22)
-        for y in (0.0, 0.1, -0.1)
-        if np.linalg.norm(bench.scene.start[:, :2] - [x, y], axis=1).min() > 0.06
-    )
     true = bench.perception
-    bench.perception = lambda image: [SeenObject(name, 1.0, free, 0.001), *true(image)]
+    bench.perception = lambda image: [SeenObject(name, 1.0, np.append(bench.free(0.2), 0.01), 0.001), *true(image)]
     outcome = bench.grasper.pick(name)
     assert outcome.success and outcome.attempts == 2 and bench.held() == {name}
 
@@ -229,11 +230,11 @@ def test_the_unsure_is_looked_at_again():
     grasp = lambda first, second: Grasper(
         bench.grasper.robot, first, program("truth").planner, bench.rest, second_look=second, on_stage=bench.tell
     )
-    for second in (lambda _: [], scored(0.15)):
+    for second in (lambda _: [], scored(0.05)):
         assert grasp(scored(0.4), second).pick(name).stage == "see"
         assert bench.said == ["look", "look again"]
         bench.said.clear()
-    assert grasp(lambda _: [], scored(0.15)).pick(name, doubtful=True).success and bench.held() == {name}
+    assert grasp(lambda _: [], scored(0.05)).pick(name, doubtful=True).success and bench.held() == {name}
 
 
 def test_the_arm_stays_where_no_way_leads_to_rest():
@@ -271,13 +272,7 @@ def test_what_lies_on_others_in_a_bin_is_not_on_the_table():
 def test_what_is_faint_and_not_there_is_tried_once():
     bench = Bench(0, "truth")
     name = bench.absent()
-    free = next(
-        np.array([x, y, 0.01])
-        for x in (0.2, 0.15, 0.22)
-        for y in (0.0, 0.1, -0.1)
-        if np.linalg.norm(bench.scene.start[:, :2] - [x, y], axis=1).min() > 0.06
-    )
-    nothing = SeenObject(name, 0.15, free, 0.001)
+    nothing = SeenObject(name, 0.15, np.append(bench.free(0.2), 0.01), 0.001)
     true = bench.perception
     bench.perception = lambda image: [*true(image), nothing]
     outcome = bench.grasper.pick(name)
@@ -323,7 +318,7 @@ def test_it_gives_up_after_several_images():
     outcome = bench.grasper.pick(name)
     assert outcome.stage == "grip" and outcome.attempts == ATTEMPTS and not outcome.success
     assert outcome.reason == "the fingers closed on nothing"
-    assert bench.said.count("look") == ATTEMPTS and bench.said[-1] == "rest"
+    assert sum(words.startswith("look") for words in bench.said) == ATTEMPTS and bench.said[-1] == "rest"
     assert bench.at_rest() and not bench.held()
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.errors import said
 
+from arm5dof.grasp.ground_truth import TrueBoxes
 from arm5dof.grasp.perception import CameraPerception
 from arm5dof.grasp.robot import SimulatedRobot
 from arm5dof.grasp.scene import TabletopScene, tabletop_scene
@@ -55,12 +56,27 @@ def test_what_cannot_be_located_is_seen_with_a_reason(detector: Detector, scene:
 
 
 def test_what_is_faint_counts_where_nothing_certain_is(scene: TabletopScene):
-    def detector(image: np.ndarray) -> Detections:
-        boxes = [[300, 200, 340, 240], [302, 201, 341, 242], [100, 300, 140, 340]]
-        return Detections(boxes, [0.9, 0.2, 0.2], [0, 1, 1], CLASS_NAMES)
-
+    true = TrueBoxes(scene)(np.zeros(0))
+    whole = np.flatnonzero(true.confidence > 0.95)[:2]  # That is how much of them is shown.
+    first, second = true.xyxy[whole]
+    boxes, ids = [first, first + 1, second], [*true.class_id[whole], 0]
+    detector = lambda _: Detections(boxes, [0.9, 0.2, 0.2], [ids[0], (ids[0] + 1) % 8, ids[1]], CLASS_NAMES)
     seen = CameraPerception(detector, scene.camera)(np.zeros((480, 640, 3), np.uint8))
-    assert [(one.name, round(one.confidence, 2)) for one in seen] == [("red cube", 0.9), ("blue cube", 0.2)]
+    names = [CLASS_NAMES[i] for i in ids[:2]]
+    assert [(one.name, round(one.confidence, 2)) for one in seen] == [(names[0], 0.9), (names[1], 0.2)]
+
+
+def test_what_looks_too_large_or_small_for_its_class_is_hardly_believed(scene: TabletopScene):
+    """A box that fits stays as sure as it is; the same one with other sizes does not."""
+    true = TrueBoxes(scene)(np.zeros(0))
+    for i in np.flatnonzero(true.confidence > 0.99):
+        low, high = true.xyxy[i, :2], true.xyxy[i, 2:]
+        middle, half = (low + high) / 2, (high - low) / 2
+        for factor, fits in ((1.0, True), (1.05, True), (0.7, False), (1.4, False)):
+            box = np.concatenate([middle - factor * half, middle + factor * half])
+            detector = lambda _, box=box, i=i: Detections([box], [0.9], true.class_id[[i]], CLASS_NAMES)
+            (seen,) = CameraPerception(detector, scene.camera)(np.zeros((480, 640, 3), np.uint8))
+            assert (seen.confidence > 0.5) == fits, (seen.name, factor)
 
 
 def test_cameras_and_images_that_do_not_fit_are_refused(detector: Detector, scene: TabletopScene):

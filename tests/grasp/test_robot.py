@@ -101,6 +101,7 @@ def test_a_dry_run_keeps_what_it_was_told():
     assert [round(c.time, 6) for c in robot.commands] == [0, 0.2, 0.7, 1.2, 1.5]
     assert [c.opening for c in robot.commands] == [0.01, 0.03, 0.03, 0.03, 0.0]
     np.testing.assert_array_equal(robot.joints(), 2 * UP)
+    assert robot.opening() == pytest.approx(0.022), "something of the width for which it was opened is held"
     with pytest.raises(UserError, match="no image"):
         robot.image()
     photo = np.zeros((4, 5, 3), np.uint8)

@@ -105,7 +105,7 @@ def test_what_is_held_must_not_hit_the_table(name):
     _, at_first = map(np.asarray, arm.pose(taken))
     free, world = World(arm), World(arm, held=Held(CAN, taken))
     clear, blocked = 0, 0
-    for q in rng.uniform(arm.lower, arm.upper, (600, arm.dof)):
+    for q in rng.uniform(arm.lower, arm.upper, (1500, arm.dof)):
         if not free.clear(q[None], 0.03):
             assert not world.clear(q[None], 0.03)
             continue
