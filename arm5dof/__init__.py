@@ -27,9 +27,9 @@ _HOMES = {
     "load_policy": "arm5dof.training.policy_file",
     "locate": "arm5dof.vision.localization",
     "make_env": "arm5dof.training.config",
-    "resume": "arm5dof.training.run",
+    "resume": "arm5dof.training.loop",
     "sweep": "arm5dof.sweeps.sweep",
-    "train": "arm5dof.training.run",
+    "train": "arm5dof.training.loop",
 }
 
 __all__ = list(_HOMES)
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
     from arm5dof.training.config import Config as Config
     from arm5dof.training.config import load_config as load_config
     from arm5dof.training.config import make_env as make_env
+    from arm5dof.training.loop import resume as resume
+    from arm5dof.training.loop import train as train
     from arm5dof.training.policy import Policy as Policy
     from arm5dof.training.policy_file import load_policy as load_policy
     from arm5dof.training.run import Run as Run
-    from arm5dof.training.run import resume as resume
-    from arm5dof.training.run import train as train
     from arm5dof.vision.camera import Camera as Camera
     from arm5dof.vision.detections import Detections as Detections
     from arm5dof.vision.detectors.loading import load_detector as load_detector

@@ -26,11 +26,11 @@ def measure(envs: int, length: int) -> dict[str, float | str]:
     import jax
 
     from arm5dof import load_config
-    from arm5dof.training import evaluate, run
+    from arm5dof.training import evaluate, loop
 
     size = dict.fromkeys(("num_envs", "episodes", "evaluate_every", "checkpoint_every"), envs)
     settings = load_config("gpu.toml", **size, episode_length=length)
-    trainer = run.make_trainer(settings)
+    trainer = loop.make_trainer(settings)
     ddpg, steps = settings.ddpg, settings.train.epoch_steps
     collect = lambda t: jax.lax.scan(lambda t, _: (trainer.agent.collect(ddpg, t)[0], None), t, None, steps)[0]
     collect = jax.jit(collect, donate_argnums=0)

@@ -158,9 +158,9 @@ def profile() -> dict[str, float]:
 
     from arm5dof import load_config
     from arm5dof.runtime import xla
-    from arm5dof.training import run
+    from arm5dof.training import loop
 
-    trainer = run.make_trainer(load_config("reach.toml"))
+    trainer = loop.make_trainer(load_config("reach.toml"))
     agent, ddpg = trainer.agent, trainer.config.ddpg
     jit = partial(jax.jit, compiler_options=xla.effort(2))
     trainer.start()
@@ -223,10 +223,10 @@ def first_step() -> dict[str, float]:
     """Compile the default experiment's program and take one step of every environment, gradient steps included."""
     from arm5dof import load_config
     from arm5dof.runtime import xla
-    from arm5dof.training import run
+    from arm5dof.training import loop
 
     xla.enable_compilation_cache()
-    trainer = run.make_trainer(load_config("reach.toml", epoch_steps=1))
+    trainer = loop.make_trainer(load_config("reach.toml", epoch_steps=1))
     trainer.start()
     trainer.advance()
     return {}

@@ -18,7 +18,7 @@ from figures import PAPER_TABLE_2
 
 from arm5dof import Run, load_config, make_env
 from arm5dof.runtime import files, xla
-from arm5dof.training.run import resume
+from arm5dof.training.loop import resume
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -76,6 +76,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         _print_help(args.parser, experiment or "reach.toml")
         args.parser.exit()
     from arm5dof.runtime.progress import Bar
+    from arm5dof.training import loop
     from arm5dof.training import run as runs
     from arm5dof.training.checkpoint import silence_abandoned_writes
     from arm5dof.training.evaluate import tables
@@ -100,12 +101,12 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
             raise UserError(f"{out} exists: choose another --out, or go on with it by --resume {out}")
         settings = _configure(experiment, texts, args.smoke)
         # What is wrong with the robot or the budget is said before a folder exists.
-        trainer = runs.make_trainer(settings)
+        trainer = loop.make_trainer(settings)
         current = runs.Run.create(settings, out, trainer.env)
     print(f"run {current.folder} on {runs.device()}", file=sys.stderr)
     try:
         with Bar("training", current.config.train.episodes, "episodes") as bar:
-            runs.resume(current, bar, trainer, loggers)
+            loop.resume(current, bar, trainer, loggers)
     except UserError as error:
         if args.resume is None and current.has_checkpoint:
             raise UserError(f"{error}; go on with arm5dof train --resume {current.folder}") from None

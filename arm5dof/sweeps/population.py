@@ -4,9 +4,7 @@ folder like any other; its numbers are those of training it alone within the reo
 
 from __future__ import annotations
 
-import csv
 import functools
-import json
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -17,9 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from arm5dof.ddpg import Training
-from arm5dof.runtime import files, xla
+from arm5dof.runtime import xla
 from arm5dof.sweeps.worker import DIVERGED, DONE, Ending, finish, not_finite
-from arm5dof.training import config, report, trainer
+from arm5dof.training import curves, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import Config
 from arm5dof.training.evaluate import evaluate_together
@@ -107,16 +105,6 @@ class _Folder(NamedTuple):
     evaluations: list[dict[str, Any]]
     loggers: list[Logger]
 
-    def write_rows(self) -> None:
-        path = self.run.folder / "metrics.csv"
-        with files.replacing(path) as temporary, open(temporary, "w", newline="") as handle:
-            writer = csv.DictWriter(handle, self.rows[0])
-            writer.writeheader()
-            writer.writerows(self.rows)
-
-    def write_evaluations(self) -> None:
-        files.write_text(self.run.folder / "evaluations.json", json.dumps(self.evaluations, indent=1) + "\n")
-
 
 def train_together(
     program: Trainer, folder: Path, members: Sequence[tuple[str, Config]], loggers: Sequence[str] = ()
@@ -138,7 +126,7 @@ def train_together(
             place = folder / name
             run = Run.open(place) if place.exists() else Run.create(settings, place, program.env)
             stack.enter_context(run.locked())
-            kept = Checkpoints(place / "checkpoints", config.fixed(settings), config.may_change(settings))
+            kept = run.checkpoints()
             stack.callback(kept.close)
             kept.check()
             at.setdefault(kept.latest, []).append(_Folder(name, run, kept, [], [], make_loggers(loggers)))
@@ -153,15 +141,9 @@ def _train(population: Population, folder: Path, members: list[_Folder], steps: 
     else:
         population.restore([member.checkpoints.restore(program.like) for member in members])
         for member in members:
-            columns = member.run.metrics
-            rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-            member.rows.extend(
-                {k: int(v) if k in Counters._fields else v for k, v in row.items()}
-                for row in rows
-                if row["steps"] <= steps
-            )
+            member.rows.extend(row for row in curves.read_rows(member.run.folder) if row["steps"] <= steps)
             member.evaluations.extend(e for e in member.run.evaluations if e["steps"] <= steps)
-    before = max((float(member.rows[-1]["seconds"]) for member in members if member.rows), default=0.0)
+    before = max((member.rows[-1]["seconds"] for member in members if member.rows), default=0.0)
     started = time.monotonic()
     alive = dict(enumerate(members))
     with ExitStack() as stack:
@@ -177,11 +159,11 @@ def _train_on(
 ) -> None:
     """Train to the end, or until nobody is alive. `offset` makes seconds of training of the clock."""
     program, settings = population.program, population.settings[0]
-    budget, length = settings.train, program.env.episode_length
+    budget = settings.train
     while alive:
         at = population.counters
         finished = at.steps >= program.total_steps
-        due = at.steps > 0 and at.steps % (budget.evaluate_every // budget.num_envs * length) == 0
+        due = program.due(at, budget.evaluate_every)
         lacking = [n for n, m in alive.items() if all(e["steps"] != at.steps for e in m.evaluations)]
         if (due or finished) and lacking:
             protocol = settings.evaluate
@@ -189,7 +171,7 @@ def _train_on(
             found = population.evaluate(targets)
             for number in lacking:
                 alive[number].evaluations.append({**at._asdict(), "targets": targets, **found[number]})
-                alive[number].write_evaluations()
+                curves.write_evaluations(alive[number].run.folder, alive[number].evaluations)
                 logs[number].evaluation(alive[number].evaluations[-1])
         if finished:
             break
@@ -202,6 +184,6 @@ def _train_on(
                 continue
             member.rows.append(trainer.row(at, seconds, metrics[number]))
             logs[number].epoch(member.rows[-1])
-            if at.steps % (budget.checkpoint_every // budget.num_envs * length) == 0 or at.steps >= program.total_steps:
-                member.write_rows()
+            if program.due(at, budget.checkpoint_every) or at.steps >= program.total_steps:
+                curves.write_rows(member.run.folder, member.rows)
                 member.checkpoints.save(population.member(number))

@@ -21,7 +21,8 @@ from arm5dof.sweeps.results import Row
 from arm5dof.sweeps.spec import Member, Spec
 from arm5dof.sweeps.worker import DONE, FAILED, Ending, Job, ended, finish
 from arm5dof.training.loggers import make_loggers
-from arm5dof.training.run import Reporter, Silent, free_folder
+from arm5dof.training.loop import Reporter, Silent
+from arm5dof.training.run import free_folder
 
 WRITE_EVERY_S = 20.0
 """The table is written this often at most while members end, and at the end."""

@@ -30,9 +30,10 @@ from arm5dof.errors import UserError
 from arm5dof.runtime import files, xla
 from arm5dof.sweeps.groups import shape
 from arm5dof.sweeps.spec import Member
-from arm5dof.training import config, run
+from arm5dof.training import config, curves, loop
 from arm5dof.training.config import Config
-from arm5dof.training.run import Run, Silent
+from arm5dof.training.loop import Silent
+from arm5dof.training.run import Run
 from arm5dof.training.trainer import Trainer
 
 PATIENCE_S = 20.0
@@ -146,7 +147,7 @@ class Worker:
     def _train(
         self, folder: Path, settings: Config, stop: Callable[[Run], bool] | None, loggers: Sequence[str]
     ) -> None:
-        """As `training.run.train` does, or `resume` where there is a run."""
+        """As `training.loop.train` does, or `resume` where there is a run."""
         if folder.exists():
             opened = Run.open(folder)
             if opened.config != settings:
@@ -158,7 +159,7 @@ class Worker:
             made = self._program(settings).again(settings)
             opened = Run.create(settings, folder, made.env)
         _wait_until_free(opened)
-        run.resume(opened, _Stopping(opened, stop) if stop else None, made, loggers)
+        loop.resume(opened, _Stopping(opened, stop) if stop else None, made, loggers)
 
 
 def _wait_until_free(opened: Run) -> None:
@@ -177,7 +178,7 @@ class _Stopping(Silent):
         self._run, self._stop, self._seen = opened, stop, 0
 
     def update(self, done: int, note: str = "") -> None:
-        path = self._run.folder / "evaluations.json"
+        path = self._run.folder / curves.EVALUATIONS
         seen = path.stat().st_mtime_ns if path.exists() else 0
         if seen != self._seen:
             self._seen = seen

@@ -174,6 +174,10 @@ class Trainer:
         env_steps = steps * self.config.train.num_envs
         return Counters(steps, env_steps // self.env.episode_length, env_steps, int(self.state.updates))
 
+    def due(self, at: Counters, every: int) -> bool:
+        """Whether so many episodes have gone by since the start, or since the last time."""
+        return at.steps > 0 and at.steps % (every // self.config.train.num_envs * self.env.episode_length) == 0
+
     @property
     def finished(self) -> bool:
         return self.counters.steps >= self.total_steps

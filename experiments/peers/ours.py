@@ -14,7 +14,7 @@ from task import Record
 
 from arm5dof import load_config
 from arm5dof.runtime import xla
-from arm5dof.training import run
+from arm5dof.training import loop
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     budget = {name: str(getattr(arguments, name)) for name in ("seed", "episodes", "num_envs")}
     every = {"evaluate_every": budget["num_envs"], "checkpoint_every": budget["num_envs"]}
     overrides = dict(pair.split("=", 1) for pair in arguments.set)
-    trainer = run.make_trainer(load_config("kinematic.toml", **budget, **every, **overrides))
+    trainer = loop.make_trainer(load_config("kinematic.toml", **budget, **every, **overrides))
 
     record = Record(arguments.out, minutes=60, transitions=trainer.total_steps * arguments.num_envs)
     trainer.start()

@@ -143,7 +143,7 @@ def test_slides_are_metres_for_programs_and_millimetres_for_people(tmp_path, cap
     created = Run.create(load_config("kinematic.toml", arm=str(tmp_path / "slides.xml"), **small), tmp_path / "run")
     trainer = created.trainer()
     trainer.state = trainer._init(created.config.ddpg, jax.random.key(0))
-    created._checkpoints().save(trainer.state)
+    created.checkpoints().save(trainer.state)
     arm = created.env.arm
     hinges = [name for name, slides in zip(arm.joint_names, arm.slides, strict=True) if not slides]
     slides = [name for name in arm.joint_names if name not in hinges]

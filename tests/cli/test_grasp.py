@@ -160,7 +160,7 @@ def test_policies_of_another_arm_or_site_are_one_line(fails: Fails, tmp_path: Pa
 def test_export_writes_what_grasp_reads(capsys: pytest.CaptureFixture[str], fails: Fails, tmp_path: Path):
     small = {"actor_width": 16, "actor_depth": 1, "critic_width": 8, "critic_depth": 1, "replay_capacity": 64}
     created = Run.create(load_config("kinematic.toml", arm="arm5.xml", site="grasp", **small), tmp_path / "run")
-    created._checkpoints().save(created.trainer()._init(created.config.ddpg, jax.random.key(0)))
+    created.checkpoints().save(created.trainer()._init(created.config.ddpg, jax.random.key(0)))
     capsys.readouterr()
     assert run("export", tmp_path / "run", tmp_path / "policy.zip") == 0
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'policy.zip'}: ")

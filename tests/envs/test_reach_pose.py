@@ -257,7 +257,7 @@ def asked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     run = Run.create(config, tmp_path_factory.mktemp("runs") / request.param)
     trainer = run.trainer()
     trainer.state = trainer._init(config.ddpg, jax.random.key(0))
-    run._checkpoints().save(trainer.state)
+    run.checkpoints().save(trainer.state)
     return run.folder, {"approach": "approach", "rotation": "quaternion"}[request.param]
 
 

@@ -24,7 +24,8 @@ from arm5dof.envs.base import episode_returns
 from arm5dof.settings import settings, static
 from arm5dof.training import evaluate
 from arm5dof.training.config import load_config, make_env
-from arm5dof.training.run import Run, train
+from arm5dof.training.loop import train
+from arm5dof.training.run import Run
 from arm5dof.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.runtime import xla
 from arm5dof.runtime.programs import Program
 from arm5dof.training.config import Config, build
-from arm5dof.training.run import make_trainer
+from arm5dof.training.loop import make_trainer
 from arm5dof.training.trainer import Trainer
 
 SMALL = {

@@ -21,7 +21,7 @@ from arm5dof.sweeps import local, spec
 from arm5dof.sweeps.groups import member_bytes
 from arm5dof.sweeps.worker import Job, Worker, ended
 from arm5dof.training import trainer
-from arm5dof.training.run import Silent, train
+from arm5dof.training.loop import Silent, train
 
 ABSURD = 1e30
 """A learning rate."""

@@ -15,7 +15,8 @@ from helpers.errors import said
 from arm5dof.training import evaluate
 from arm5dof.training.config import load_config
 from arm5dof.training.loggers import Point, Values, logging, make_loggers
-from arm5dof.training.run import Run, Silent, resume, train
+from arm5dof.training.loop import Silent, resume, train
+from arm5dof.training.run import Run
 
 TINY = {
     **{"episodes": 4, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 20, "interim_targets": 20},

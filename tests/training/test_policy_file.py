@@ -31,7 +31,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     config = load_config("reach_pose.toml", arm="arm5.xml", site="grasp", branches=2, restarts=1, **SMALL)
     created = Run.create(config, tmp_path_factory.mktemp("runs") / "small")
     trainer = created.trainer()
-    created._checkpoints().save(trainer._init(config.ddpg, jax.random.key(0)))
+    created.checkpoints().save(trainer._init(config.ddpg, jax.random.key(0)))
     return created
 
 

@@ -24,7 +24,8 @@ from arm5dof.runtime import files
 from arm5dof.training import config, evaluate
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import load_config
-from arm5dof.training.run import Run, Silent, resume, train
+from arm5dof.training.loop import Silent, resume, train
+from arm5dof.training.run import Run
 
 TINY = {
     **{"episodes": 4, "num_envs": 2, "evaluate_every": 2, "checkpoint_every": 2, "targets": 40, "interim_targets": 40},
