@@ -1,6 +1,6 @@
 """How often grasping works, from pixels and with ground truth, under disturbances, and where requests are lost.
 
-python experiments/grasping.py                    every row, its number of scenes in `SCENES`: results/
+python experiments/grasping.py                    every row, `SCENES` scenes each: results/
 python experiments/grasping.py --scenes 50        quicker; nothing is written
 python experiments/grasping.py --rows "from pixels" "ground truth"
 python experiments/grasping.py --figure docs/grasp.png
@@ -78,14 +78,8 @@ ROWS = {
     "friction halved": replace(PAPER, disturbance=Disturbance(friction=0.5)),
     "mass doubled": replace(PAPER, disturbance=Disturbance(mass=2.0)),
 }
-SCENES = dict.fromkeys(ROWS, 200) | {
-    "from pixels": 1000,
-    "ground truth": 1000,
-    "from pixels, into the bin of its class": 1000,
-    "six objects sorted into bins, from pixels": 100,
-    "seven joints, from pixels": 500,
-}
-"""Half a second to six seconds each, on two cores."""
+SCENES = 1000
+"""Of every row, half a second to three seconds each on two cores."""
 
 
 def main() -> None:
@@ -109,7 +103,7 @@ def main() -> None:
     path = RESULTS / "grasping.json"
     found = json.loads(path.read_text()) if path.exists() else {}
     for name in arguments.rows or ROWS:
-        scenes = arguments.scenes or SCENES[name]
+        scenes = arguments.scenes or SCENES
         with Bar(name, scenes, "scenes") as bar:
             found[name] = evaluate(ROWS[name], scenes, bar.update).as_json()
         print(name, json.dumps(found[name]))

@@ -195,7 +195,7 @@ def test_every_edited_setting_is_refused_by_name_or_may_change(runs: dict[str, P
         (folder / "config.toml").write_text(text)
         run = edit(folder, **{name: value})
         if name in MAY_CHANGE:
-            run._checkpoints(read_only=True).check()
+            run.checkpoints(read_only=True).check()
             continue
         for call in (run.policy, lambda run=run: resume(run), lambda run=run: run.evaluate(1)):
             assert f"({name} = {now[name]!r}, now {value!r})" in said(call), name
@@ -242,7 +242,7 @@ def test_a_setting_of_which_an_older_version_did_not_know_that_it_may_change(run
         kept["settings"]["env.branches"] = kept["budget"].pop("env.branches")
         path.write_text(json.dumps(kept))
     assert Run.open(folder).policy().solve(GOALS).q.shape == (3, 5)
-    assert edit(folder, **{"env.branches": 2})._checkpoints(read_only=True).check() == {"env.branches": (1, 2)}
+    assert edit(folder, **{"env.branches": 2}).checkpoints(read_only=True).check() == {"env.branches": (1, 2)}
 
 
 def test_a_run_does_not_change_with_the_tasks_toml(tmp_path: Path):
@@ -299,7 +299,7 @@ def test_a_longer_budget_goes_on_and_stretches_the_schedules(twenty: Path, tmp_p
     assert all((kept[name] == value).all() for name, value in state.items()), "nothing is trained yet"
 
     by_hand = longer.trainer()
-    by_hand.state = longer._checkpoints(read_only=True).restore(by_hand.like)
+    by_hand.state = longer.checkpoints(read_only=True).restore(by_hand.like)
     while not by_hand.finished:
         by_hand.advance()
     resume(longer, told)
