@@ -218,9 +218,12 @@ class Grasper:
         way = self._driver.approach(np.append(where, height), opening)
         if isinstance(way, str):
             return Outcome("place", f"the place is {way}")
-        self._driver.go(way)
+        arrived = self._driver.go(way)
         if self.robot.opening() < LEAST:
             return self._give_up("lift", "the object was lost on the way", way)
+        if not arrived:
+            self._driver.retreat(way)
+            return Outcome("collide", "the arm met something on the way to the place")
         self.robot.grip(opening + SLACK)
         self._driver.held = None
         self._driver.retreat(way)

@@ -297,6 +297,23 @@ def test_what_cannot_be_placed_is_still_held():
     assert said(lambda: bench.grasper.place(bin="red cube")) == nothing
 
 
+def test_where_the_arm_is_stopped_on_the_way_to_a_place_nothing_is_dropped():
+    """It stops halfway, as before a wall that nobody knows of."""
+    bench = Bench(1, "truth")
+    assert bench.grasper.pick("can").success
+    five, halves = bench.grasper.robot, iter([True, True])
+
+    def move(times: np.ndarray, joints: np.ndarray) -> None:
+        share = 0.5 if next(halves, False) else 1.0
+        bench.robot.move(times, five.joints() + share * (joints - five.joints()))
+
+    five.move = move
+    outcome = bench.grasper.place(bench.free(0.19))
+    assert outcome.stage == "collide" and outcome.reason == "the arm met something on the way to the place"
+    assert bench.grasper.holds == "can" and bench.robot.opening() > 0.02
+    assert bench.grasper.put_back().success and bench.at_rest()
+
+
 @pytest.mark.parametrize("eyes", EYES)
 def test_fingers_that_close_on_nothing_feel_it(eyes: Eyes):
     """The object is gone when the arm comes, and the next image shows it."""
