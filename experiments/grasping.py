@@ -189,7 +189,8 @@ def markdown(found: dict[str, dict]) -> str:
     lines = [
         "# Grasping: one object of a random class that is there, lifted by 5 cm and held for 2 s",
         "",
-        f"Command: `python experiments/grasping.py`, seed {SEED}. {platform.machine()} CPU. Success is of the",
+        f"Command: `python experiments/grasping.py`, rows of not {SCENES:,} scenes with `--scenes N --rows ROW`;",
+        f"seed {SEED}, {platform.machine()} CPU. Success is of the",
         "requests that the arm can reach and of which the camera sees half or more; in brackets, of all it can reach.",
         "Told: requests that cannot be met and ended with the arm at rest, the gripper empty and a reason.",
         "",
