@@ -52,10 +52,10 @@ class World:
             raise UserError("the planner needs the arm's MJCF file, not its compiled model alone")
         spec = arm.mj_spec.copy()
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        for geom in spec.geoms:
-            geom.contype, geom.conaffinity, geom.margin, geom.gap = ARM, 0, 0, 0
         if held is not None:
             _add_held(spec, arm, held)
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity, geom.margin, geom.gap = ARM, 0, 0, 0
         around = [spec.worldbody.add_geom(name="known table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1])]
         for one in bins:
             around += one.add_to(spec)
@@ -137,13 +137,12 @@ def _add_held(spec: mujoco.MjSpec, arm: Arm, held: Held) -> None:
     hand = model.site_bodyid[site]
     to_hand, quaternion = data.xmat[hand].reshape(3, 3).T, np.empty(4)
     mujoco.mju_quatZ2Vec(quaternion, to_hand[:, 2].copy())
-    geom = spec.site(SITE).parent.add_geom(
+    spec.site(SITE).parent.add_geom(
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
         size=[held.kind.radius, held.kind.half_height, 0],
         pos=to_hand @ (data.site_xpos[site] - data.xpos[hand]),
         quat=quaternion,
     )
-    geom.contype, geom.conaffinity, geom.margin, geom.gap = ARM, 0, 0, 0
 
 
 def dense(path: np.ndarray) -> np.ndarray:
