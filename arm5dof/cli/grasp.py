@@ -88,13 +88,13 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
     from arm5dof.grasp.shipped import ARMS, shipped
 
     policy = args.policy or shipped(args.arm).policy
+    radii = tuple(args.radii) if args.radii else ARMS.get(args.arm, ARMS["arm5.xml"]).radii
     if args.image is not None:
-        return _photograph(args, policy)
+        return _photograph(args, policy, radii)
     from arm5dof.grasp.evaluation import Program, Setting, evaluate
     from arm5dof.grasp.score import Score, table
     from arm5dof.runtime.progress import Bar
 
-    radii = tuple(args.radii) if args.radii else ARMS.get(args.arm, ARMS["arm5.xml"]).radii
     place = tuple(args.place) if args.place else None
     setting = Setting(policy, args.arm, radii, args.seed, args.eyes, args.pick, place, args.bin)
     if args.task is not None:
@@ -145,7 +145,7 @@ def _watched(program: Program, video: Path | None, quiet: bool) -> Trial:
     return trial
 
 
-def _photograph(args: argparse.Namespace, policy: Path) -> int:
+def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, float]) -> int:
     """Plan for a photograph, and print what an arm would be told."""
     from arm5dof.arm import load_arm
     from arm5dof.grasp.grasper import Grasper
@@ -165,7 +165,7 @@ def _photograph(args: argparse.Namespace, policy: Path) -> int:
     image = images.read(args.image)
     arm = load_arm(args.arm, SITE)
     planner = Planner(load_policy(policy), arm)
-    rest = World(arm).rest(camera)
+    rest = World(arm).rest(camera, radii)
     robot = DryRun(arm, rest, image=image)
     grasper = Grasper(robot, quick, planner, rest, second_look=thorough)
     outcome = grasper.pick(args.pick)

@@ -145,7 +145,7 @@ class Program:
             disturbance=s.disturbance,
         )
         seen = build()
-        return build(start=World(self.planner.arm, seen.bins.values()).rest(seen.camera))
+        return build(start=World(self.planner.arm, seen.bins.values()).rest(seen.camera, s.radii))
 
     def perceptions(self, scene: TabletopScene) -> list[Perception]:
         """What is seen of a scene, at the first look and at the second."""

@@ -16,13 +16,14 @@ from arm5dof.grasp.gripper import SITE, Gripper
 from arm5dof.grasp.perception import SeenObject
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.objects import CATALOGUE, CatalogueObject
+from arm5dof.vision.synthetic.scenes import MAX_RADIUS, MIN_RADIUS
 
 STEP = 0.04
 """How finely motions are checked: the largest turn of a joint between one pose and the next, radians."""
 REST_POSES = 400
 """Among so many random poses the one is taken that hides least from the camera."""
-ROOM = (0.08, 0.28)
-"""Where the camera should see the table: distances from the arm's axis, metres."""
+MARGINS = (0.02, 0.03)
+"""How much nearer to the arm's axis and further from it than objects lie the camera should see the table, metres."""
 ARM, OTHERS = 1, 2
 
 
@@ -87,19 +88,20 @@ class World:
         """
         return all(self._clear(q, opening, without, allowed) for q in dense(path))
 
-    def rest(self, camera: Camera, opening: float = 0.0) -> np.ndarray:
+    def rest(self, camera: Camera, radii: tuple[float, float] = (MIN_RADIUS, MAX_RADIUS)) -> np.ndarray:
         """A pose out of the camera's way, (dof,), radians: of random poses that hit nothing the one that hides least of
         the table where objects are, and among those the one nearest the middle of the joints' ranges. The same for the
-        same arm and camera."""
+        same arm, camera and radii: how near and how far from the arm's axis objects lie, metres."""
         rng = np.random.default_rng(0)
         origin = np.asarray(camera.position, float)
-        radius, azimuth = np.meshgrid(np.linspace(*ROOM, 5), np.deg2rad(np.linspace(-110, 110, 23)))
+        near, far = radii[0] - MARGINS[0], radii[1] + MARGINS[1]
+        radius, azimuth = np.meshgrid(np.linspace(near, far, 5), np.deg2rad(np.linspace(-110, 110, 23)))
         points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full_like(radius, 0.02)], -1)
         ways = (points.reshape(-1, 3) - origin) / np.linalg.norm(points.reshape(-1, 3) - origin, axis=1)[:, None]
         best, least = self.arm.home, (np.inf, np.inf)
         for _ in range(REST_POSES):
             q = rng.uniform(self.arm.lower, self.arm.upper)
-            if not self._clear(q, opening, None, 0.0):
+            if not self._clear(q, 0.0, None, 0.0):
                 continue
             mujoco.mj_forward(self.model, self._data)
             hidden = self._hidden(origin, ways)

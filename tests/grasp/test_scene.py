@@ -69,6 +69,16 @@ def test_it_rests_until_something_touches_it(arm, radii):
         assert np.abs(data.qpos[scene.arm.qpos] - joints).max() < 1e-3
 
 
+@pytest.mark.parametrize("radii", [(0.1, 0.25), (0.18, 0.32), (0.5, 0.9)])
+def test_the_camera_sees_where_objects_lie(radii):
+    seen = []
+    for number in range(20):
+        scene = tabletop_scene((3, number), radii=radii, distractors=False)
+        pixels = np.asarray(scene.camera.project(scene.start))
+        seen += list(((pixels >= 0) & (pixels < (scene.camera.width, scene.camera.height))).all(1))
+    assert np.mean(seen) > 0.95
+
+
 def test_objects_have_mass_and_friction_and_nothing_else_holds_them():
     objects = [placed(name, 0.2, -0.2 + 0.06 * i) for i, name in enumerate(CLASS_NAMES)]
     light, heavy = (

@@ -14,7 +14,7 @@ from arm5dof.errors import UserError
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.perception import SeenObject
 from arm5dof.grasp.scene import ARM_BIT, TabletopScene, tabletop_scene
-from arm5dof.grasp.world import ROOM, STEP, Held, World, dense
+from arm5dof.grasp.world import STEP, Held, World, dense
 from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
 from arm5dof.vision.rendering.simulated import simulated_camera
 from arm5dof.vision.synthetic.scene_builder import CAMERA
@@ -128,9 +128,9 @@ def test_dense_paths_keep_their_poses_and_take_small_steps():
     np.testing.assert_array_equal(dense(path[:1]), path[:1])
 
 
-def hidden(scene: TabletopScene) -> float:
+def hidden(scene: TabletopScene, radii: tuple[float, float]) -> float:
     """The share of the table, where objects may lie, that the arm hides from the camera."""
-    radius, azimuth = np.meshgrid(np.linspace(*ROOM, 12), np.deg2rad(np.linspace(-100, 100, 60)))
+    radius, azimuth = np.meshgrid(np.linspace(*radii, 12), np.deg2rad(np.linspace(-100, 100, 60)))
     points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full_like(radius, 0.02)], -1)
     pixels = np.round(np.asarray(scene.camera.project(points.reshape(-1, 3)))).astype(int)
     mujoco.mj_forward(scene.model, scene.data)
@@ -145,11 +145,12 @@ def hidden(scene: TabletopScene) -> float:
 def test_at_rest_the_arm_hides_little_and_hits_nothing(name):
     for number in range(3):
         scene = tabletop_scene((31, number), arm=name, radii=ARMS[name])
-        rest = World(gripping_arm(name), scene.bins.values()).rest(scene.camera)
-        np.testing.assert_array_equal(rest, World(gripping_arm(name), scene.bins.values()).rest(scene.camera))
+        rest = World(gripping_arm(name), scene.bins.values()).rest(scene.camera, ARMS[name])
+        again = World(gripping_arm(name), scene.bins.values()).rest(scene.camera, ARMS[name])
+        np.testing.assert_array_equal(rest, again)
         scene = tabletop_scene((31, number), arm=name, radii=ARMS[name], start=rest)
         assert not (scene.model.geom_contype[scene.data.contact.geom] == ARM_BIT).any()
-        assert hidden(scene) < 0.02
+        assert hidden(scene, ARMS[name]) < 0.02
 
 
 def test_a_compiled_arm_is_refused():

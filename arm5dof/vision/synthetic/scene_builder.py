@@ -104,8 +104,13 @@ class SceneBuilder:
             light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL if distant else mujoco.mjtLightType.mjLIGHT_SPOT
             light.cutoff, light.exponent = u(40, 70), u(0, 10)
 
-    def camera(self, name: str) -> None:
-        """Add a camera 0.6 to 0.9 m away, from overhead to 35 degrees above the table, where the arm works."""
+    def camera(self, name: str, scale: float = 1.0) -> None:
+        """Add a camera 0.6 to 0.9 m away, from overhead to 35 degrees above the table, where the arm works.
+
+        Args:
+            name: Its name.
+            scale: By how much the arm's work is larger: so much further away it stands.
+        """
         u = self.rng.uniform
         azimuth, elevation = u(-1.9, 1.9), np.arcsin(u(np.sin(np.deg2rad(35)), 1))
         back, right = _direction(azimuth, elevation), np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -113,7 +118,7 @@ class SceneBuilder:
         x, y = np.cos(roll) * right + np.sin(roll) * up, np.cos(roll) * up - np.sin(roll) * right
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, np.stack([x, y, back], 1).ravel())
-        position = np.array([0.12, 0.0, 0.01]) + self.rng.normal(0, 0.02, 3) + u(0.6, 0.9) * back
+        position = scale * (np.array([0.12, 0.0, 0.01]) + self.rng.normal(0, 0.02, 3) + u(0.6, 0.9) * back)
         self.spec.worldbody.add_camera(name=name, pos=position, quat=quaternion, fovy=u(32, 42))
 
     def _add(self, body: mujoco.MjsBody, part: Part, material: str) -> None:

@@ -152,8 +152,9 @@ def random_layout(
     )
     builder.paper()
     builder.lamps(distant=style == "evaluation")
-    builder.camera(CAMERA)
-    builder.camera(SECOND)
+    scale = max(1.0, radii[1] / MAX_RADIUS)
+    builder.camera(CAMERA, scale)
+    builder.camera(SECOND, scale)
     return Layout(builder, pose, tuple(placed), tuple(distractors))
 
 
