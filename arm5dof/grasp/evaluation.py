@@ -178,6 +178,7 @@ class Program:
         up = scene.lifted(LIFT)
         lifted = {name for name, is_up in zip(names, up, strict=True) if is_up}
         held, wrong = outcome.success and asked in lifted, bool(lifted - {asked})
+        reachable = reachable or held  # By its end, where its middle is just out of reach.
         placed = True
         if held and (place or s.bin):
             bin = asked if s.bin == CLASS else s.bin

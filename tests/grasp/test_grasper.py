@@ -97,6 +97,14 @@ def test_what_is_asked_for_is_lifted_and_held(number: int, eyes: Eyes):
     assert bench.said[0] == "look" and bench.said[-2:] == [f"grasp the {asked}", "lift"]
 
 
+def test_what_is_lifted_was_within_reach(monkeypatch: pytest.MonkeyPatch):
+    """An object may be held by its end, whose middle the arm does not reach."""
+    program = Program(Setting(shipped("arm5.xml").policy, "arm5.xml", (0.1, 0.25), 31, "truth"))
+    monkeypatch.setattr(program, "_reaches", lambda _: False)
+    trial = program.trial(1)
+    assert trial.success and trial.reachable and not trial.said
+
+
 @pytest.mark.parametrize("eyes", EYES)
 def test_what_is_not_there_is_said_not_to_be(eyes: Eyes):
     bench = Bench(0, eyes)
