@@ -1,0 +1,113 @@
+"""`arm5dof arm`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arm5dof.cli.parser import nothing_left
+from arm5dof.errors import UserError
+
+if TYPE_CHECKING:
+    from arm5dof.arm import Arm
+
+HELP = """\
+Tell how a robot's MJCF or URDF is read as an arm: the first thing to run on a new one.
+
+  arm5dof arm my_robot.xml                              joints, end effector, reach, and what may be trained
+  arm5dof arm my_robot.xml --site tool0                 another end effector: a site,
+  arm5dof arm my_robot.xml --site "body hand 0 0 0.1"   or a place on a body or geom, metres in its frame
+  arm5dof arm rover.xml --base chassis                  an arm on a mobile or free base, which is held still
+  arm5dof arm my_robot.xml --figure arm.png             a picture, with the end effector's axes: x red, y green, z blue
+
+Joints are those on the way from the world or the base to the end effector; whatever else moves is left alone. A hinge
+without limits is trained over one turn. What cannot be an arm is refused with all that is wrong with it.
+The same --site and --base go to arm5dof train --arm my_robot.xml.
+"""
+
+
+def declare(commands: argparse._SubParsersAction) -> None:
+    """Add `arm` to the commands."""
+    p = commands.add_parser("arm", help="tell how a robot is read, before it is trained", description=HELP)
+    p.add_argument("file", metavar="FILE", help="an MJCF or URDF file, or the name of an MJCF that ships")
+    p.add_argument("--site", default="", help="the end effector; default: the site ee, else what is named like a tool")
+    p.add_argument("--base", default="", metavar="BODY", help="hold this body still, with all that carries it")
+    p.add_argument("--json", action="store_true", help="print one JSON object, in radians and metres")
+    p.add_argument("--figure", type=Path, metavar="OUT.png", help="draw it, its joints in the middle of their ranges")
+    p.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace, rest: list[str]) -> None:
+    """`arm5dof arm`."""
+    nothing_left(rest, "arm")
+    if args.figure is not None:
+        from arm5dof.cli.vision.options import writable
+
+        writable(args.figure, (".png",))
+    from arm5dof.arm import load_arm
+
+    arm = load_arm(args.file, args.site, args.base)
+    refused = {dynamics: _refused(args, dynamics) for dynamics in ("kinematic", "servo")}
+    if args.json:
+        print(json.dumps(_as_json(arm, refused)))
+    else:
+        print(arm.table().text())
+        for dynamics, reason in refused.items():
+            print(f"{dynamics} dynamics: {f'no, {reason}' if reason else 'yes'}")
+    if args.figure is not None:
+        _draw(arm, args.figure)
+
+
+def _refused(args: argparse.Namespace, dynamics: str) -> str:
+    """Why a training would refuse the robot; empty if it would not."""
+    from arm5dof.training.config import load_config, make_env
+
+    try:
+        make_env(load_config("reach.toml", arm=args.file, site=args.site, base=args.base, dynamics=dynamics)).check()
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+def _as_json(arm: Arm, refused: dict[str, str]) -> dict[str, Any]:
+    base, position, rotation = arm.base
+    columns = (arm.joint_names, arm.slides, arm.continuous, arm.lower, arm.upper, arm.actuation)
+    return {
+        "end_effector": arm.mj_model.site(arm.site).name,
+        "chosen": arm.why_site or None,
+        "base": {"body": base, "position_m": position.tolist(), "rotation": rotation.tolist()},
+        "held": list(arm.held),
+        "origin_m": arm.origin.tolist(),
+        "reach_m": arm.measured_reach,
+        "joints": [
+            {
+                "name": name,
+                "kind": "slide" if slides else "continuous" if endless else "hinge",
+                "unit": "m" if slides else "rad",
+                "lower": float(lower),
+                "upper": float(upper),
+                "actuator": actuator,
+            }
+            for name, slides, endless, lower, upper, actuator in zip(*columns, strict=True)
+        ],
+        "dynamics": {dynamics: {"works": not reason, "reason": reason or None} for dynamics, reason in refused.items()},
+    }
+
+
+def _draw(arm: Arm, path: Path) -> None:
+    """Write a picture of the arm in the middle of its ranges."""
+    import cv2
+    import jax.numpy as jnp
+    import numpy as np
+
+    from arm5dof.vision.rendering.portrait import portrait
+
+    q = jnp.asarray(arm.home)
+    qpos = arm.mj_model.qpos0.copy()
+    qpos[arm.qpos] = q
+    points = np.stack([*np.asarray(arm.joint_positions(q)), np.asarray(arm.forward(q)), arm.base[1]])
+    assert arm.mj_spec is not None  # It comes from a file.
+    image = portrait(arm.mj_spec, qpos, points, arm.mj_model.site(arm.site).name)
+    path.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
