@@ -84,7 +84,8 @@ class Arm:
             with jax.ensure_compile_time_eval():  # It may be wanted first while a program is traced.
                 return mjx.put_model(self.mj_model)
         except Exception as error:  # NotImplementedError mostly, or whatever MJX's own code runs into.
-            raise UserError(f"MJX cannot simulate this model ({error}): change it, or use kinematic dynamics") from None
+            change = 'give such geoms contype="0" conaffinity="0"' if "collisions" in str(error) else "change it"
+            raise UserError(f"MJX cannot simulate this model ({error}): {change}, or use kinematic dynamics") from None
 
     @property
     def dof(self) -> int:
@@ -239,7 +240,7 @@ class Arm:
         title = f"Arm of {self.dof} joints{held}, {end}, reach {self.measured_reach:.3f} m from {point(self.origin)}"
         base, position, rotation = self.base
         angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
-        if angle > 0.1 or np.abs(position[:2]).max() > 1e-4:
+        if angle > 0.1 or np.abs(position).max() > 1e-4:
             title += (
                 f"; its base {base!r} stands at {point(position)}, turned by {angle:.0f} degrees, in the world frame"
             )

@@ -36,6 +36,7 @@ def hold_base(
         raise UserError(f"a compiled model cannot be held at {base!r}: load the arm from its MJCF")
     held, named = tuple(joint_name(model, j) for j in joints), {model.joint(j).name for j in joints} - {""}
     spec = spec.copy()
+    spec.compiler.fusestatic = False  # It would make the base a part of the world.
     for body in [body for body in spec.bodies if body.id in path]:
         for joint in list(body.joints):
             spec.delete(joint)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import mujoco
@@ -25,8 +26,8 @@ TOOLS = (
     "flange",
 )
 """What tools are called, the most telling first, in a name whose words are apart and in lower case."""
-PARTS = re.compile("finger|jaw|pad|cam|knuckle|thumb|driver|spring|follower|coupler")
-"""What parts of a tool, and cameras on it, are called."""
+PARTS = re.compile("^(?!.*(static|fixed)).*(finger|fngr|thumb|mov|pad|cam|knuckle|driver|spring|follower|coupler)")
+"""What moving parts of a tool, and cameras on it, are called."""
 
 
 class EndEffector(NamedTuple):
@@ -117,43 +118,45 @@ def _choose(spec: mujoco.MjSpec | None, model: mujoco.MjModel) -> EndEffector:
     depth = [len(joints_of(model, path_to(model, b))) for b in range(model.nbody)]
     if not max(depth):
         raise UserError("the model has no joints that could be an arm's")
-    sites = [(model.site(i).name, int(model.site_bodyid[i])) for i in range(model.nsite)]
-    bodies = [(model.body(b).name, b) for b in range(model.nbody)]
-    site, others = _most_like_a_tool(sites, depth, deepest=True)
+    # A tool's site is at its tip, its body where it begins; a body without geoms is there to be a frame.
+    sites = {i: (model.site(i).name, (-depth[b],)) for i, b in enumerate(model.site_bodyid) if depth[b]}
+    bodies = {b: (model.body(b).name, (d, int(model.body_geomnum[b]) > 0)) for b, d in enumerate(depth) if d}
+    site, site_why = _most_like_a_tool(sites)
+    body, body_why = _most_like_a_tool(bodies)
     if site is not None:
-        why = f"chosen: site {sites[site][0]!r}, by its name{_also(sites, others)}"
+        why = f"chosen: site {site_why}"
         if spec is None:
             return EndEffector(spec, model, site, why)
-        place = _Place(sites[site][1], model.site_pos[site].copy(), model.site_quat[site].copy())
+        place = _Place(int(model.site_bodyid[site]), model.site_pos[site].copy(), model.site_quat[site].copy())
         return _with_site(spec, model, DEFAULT, place, why)
-    body, others = _most_like_a_tool(bodies, depth, deepest=False)
-    if body is not None:
-        why = f"chosen: body {bodies[body][0]!r}, by its name{_also(bodies, others)}"
-    else:
+    if body is None:
         body = _last_link(model)
-        why = f"chosen: body {bodies[body][0] or body!r}, the last link of the longest chain of joints"
-    return _with_site(spec, model, DEFAULT, _Place(body, np.zeros(3), np.array([1.0, 0, 0, 0])), why)
+        body_why = f"{model.body(body).name or body!r}, the last link of the longest chain of joints"
+    place = _Place(body, np.zeros(3), np.array([1.0, 0, 0, 0]))
+    return _with_site(spec, model, DEFAULT, place, f"chosen: body {body_why}")
 
 
-def _most_like_a_tool(named: list[tuple[str, int]], depth: list[int], deepest: bool) -> tuple[int | None, list[int]]:
-    """Which of some names, each with its body, says most clearly that it is a tool, and those that say so as clearly.
-    A tool's site is at its tip, its body where it begins."""
-    ranked = [
-        (rank, -depth[body] if deepest else depth[body], i)
-        for i, (name, body) in enumerate(named)
-        if depth[body] and (rank := _rank(name)) is not None
-    ]
+def _most_like_a_tool(named: Mapping[int, tuple[str, tuple[int, ...]]]) -> tuple[int | None, str]:
+    """Of names by id, each with what is to be smallest beside, the id of the one that says most clearly that it is a
+    tool, and why it; None if none does."""
+    ranked = [(rank, *rest, i) for i, (name, rest) in named.items() if (rank := _rank(name)) is not None]
     if not ranked:
-        return None, []
+        return None, ""
     best = min(ranked)
-    return best[2], [i for rank, joints, i in ranked if (rank, joints) == best[:2] and i != best[2]]
+    others = ", ".join(repr(named[i][0]) for *rest, i in ranked if (*rest,) == best[:-1] and i != best[-1])
+    also = f" (so could be {others})" if others else ""
+    return best[-1], f"{named[best[-1]][0]!r}, by its name{also}"
 
 
 def _rank(name: str) -> int | None:
-    words = re.sub(r"[^a-z]+", " ", name.lower())
+    words = _words(name)
     if PARTS.search(words):
         return None
     return next((k for k, tool in enumerate(TOOLS) if re.search(tool, words)), None)
+
+
+def _words(name: str) -> str:
+    return re.sub(r"[^a-z]+", " ", name.lower())
 
 
 def _last_link(model: mujoco.MjModel) -> int:
@@ -162,8 +165,6 @@ def _last_link(model: mujoco.MjModel) -> int:
     paths = [path_to(model, b) for b in range(model.nbody)]
     slides = [[bool(model.jnt_type[j] == SLIDE) for j in joints_of(model, path)] for path in paths]
     sign = -1 if not all(map(all, slides)) else 1
-    return max(range(model.nbody), key=lambda b: (slides[b].count(False), sign * sum(slides[b]), len(paths[b]), -b))
-
-
-def _also(named: list[tuple[str, int]], others: list[int]) -> str:
-    return f" (so could be {', '.join(repr(named[i][0]) for i in others)})" if others else ""
+    links = [b for b in range(model.nbody) if slides[b] and not PARTS.search(_words(model.body(b).name))]
+    key = lambda b: (slides[b].count(False), sign * sum(slides[b]), len(paths[b]), -b)
+    return max(links or [b for b in range(model.nbody) if slides[b]], key=key)

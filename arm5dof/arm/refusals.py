@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -14,7 +16,6 @@ WRAPS_JOINT, SITE = int(mujoco.mjtWrap.mjWRAP_JOINT), int(mujoco.mjtObj.mjOBJ_SI
 
 def unfit_joints(model: mujoco.MjModel, joints: np.ndarray) -> list[str]:
     """What is said of the chain's joints that no arm can have, all of them."""
-    quoted = lambda some: ", ".join(repr(joint_name(model, j)) for j in some)
     other = [j for j in joints if model.jnt_type[j] not in (HINGE, SLIDE)]
     endless = [j for j in joints if model.jnt_type[j] == SLIDE and not model.jnt_limited[j]]
     found = []
@@ -24,28 +25,26 @@ def unfit_joints(model: mujoco.MjModel, joints: np.ndarray) -> list[str]:
         what = (
             "joint {} is neither a hinge nor a slide" if len(other) == 1 else "joints {} are neither hinges nor slides"
         )
-        found.append(f"{what.format(quoted(other))}: {hold(other) or 'name its body, to hold it as base'}")
+        found.append(f"{what.format(_quoted(model, other))}: {hold(other) or 'name its body, to hold it as base'}")
     if endless:
         what = "slide {} has no limits" if len(endless) == 1 else "slides {} have no limits"
         remedies = filter(None, ('give range="LOWER UPPER" in the MJCF', hold(endless)))
-        found.append(f"{what.format(quoted(endless))}: {', or '.join(remedies)}")
+        found.append(f"{what.format(_quoted(model, endless))}: {', or '.join(remedies)}")
     return found
 
 
 def couplings(model: mujoco.MjModel, joints: np.ndarray) -> list[str]:
     """What is said of the equalities that keep the chain's joints from being independent, all of them."""
-    found = []
+    tied: dict[str, set[int]] = {}
     for e in range(model.neq):
-        tied = sorted(_tied(model, e) & {int(j) for j in joints}) if model.eq_active0[e] else []
-        if tied:
-            names = ", ".join(repr(joint_name(model, j)) for j in tied)
-            called = model.equality(e).name
+        if model.eq_active0[e] and (of_arm := _tied(model, e) & {int(j) for j in joints}):
             kind = str(mujoco.mjtEq(model.eq_type[e]).name).removeprefix("mjEQ_").lower()
-            found.append(
-                f"equality {f'{called!r} ' if called else ''}<{kind}> couples {names}, which an arm moves freely: take "
-                "it out of the MJCF if the robot is not so, else choose an end effector in front of it"
-            )
-    return found
+            tied.setdefault(kind, set()).update(of_arm)
+    return [
+        f"<equality> couples {_quoted(model, sorted(some))} by <{kind}>; an arm moves its joints freely: take it out "
+        "if the robot is not so, else choose an end effector in front of it"
+        for kind, some in tied.items()
+    ]
 
 
 def _tied(model: mujoco.MjModel, e: int) -> set[int]:
@@ -63,3 +62,7 @@ def _tied(model: mujoco.MjModel, e: int) -> set[int]:
         wraps = [w for t in tendons for w in range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])]
         return {int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == WRAPS_JOINT}
     return set()
+
+
+def _quoted(model: mujoco.MjModel, joints: Iterable[int]) -> str:
+    return ", ".join(repr(joint_name(model, j)) for j in joints)

@@ -47,31 +47,50 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
         writable(args.figure, (".png",))
     from arm5dof.arm import load_arm
+    from arm5dof.arm.settling import settle_steps
 
     arm = load_arm(args.file, args.site, args.base)
-    refused = {dynamics: _refused(args, dynamics) for dynamics in ("kinematic", "servo")}
+    dynamics = {name: _try(args, name) for name in ("kinematic", "servo")}
+    steps = settle_steps(arm) if dynamics["servo"]["works"] else None
+    dynamics["servo"]["settle_steps"] = steps
     if args.json:
-        print(json.dumps(_as_json(arm, refused)))
+        print(json.dumps(_as_json(arm, dynamics)))
     else:
         print(arm.table().text())
-        for dynamics, reason in refused.items():
-            print(f"{dynamics} dynamics: {f'no, {reason}' if reason else 'yes'}")
+        print(f"kinematic dynamics: {'yes' if dynamics['kinematic']['works'] else dynamics['kinematic']['reason']}")
+        print(f"servo dynamics: {_servos(dynamics['servo'])}")
     if args.figure is not None:
         _draw(arm, args.figure)
 
 
-def _refused(args: argparse.Namespace, dynamics: str) -> str:
-    """Why a training would refuse the robot; empty if it would not."""
+def _try(args: argparse.Namespace, dynamics: str) -> dict[str, Any]:
+    """Whether a training would take the robot, else why not, and the physics steps in a control step."""
     from arm5dof.training.config import load_config, make_env
 
+    config = load_config("reach.toml", arm=args.file, site=args.site, base=args.base, dynamics=dynamics)
     try:
-        make_env(load_config("reach.toml", arm=args.file, site=args.site, base=args.base, dynamics=dynamics)).check()
+        make_env(config).check()
     except UserError as error:
-        return str(error)
-    return ""
+        return {"works": False, "reason": str(error)}
+    return {"works": True, "reason": None, "substeps": config.env.substeps}
 
 
-def _as_json(arm: Arm, refused: dict[str, str]) -> dict[str, Any]:
+def _servos(servo: dict[str, Any]) -> str:
+    """Whether they can be trained, and whether an action gets where it asks for."""
+    if not servo["works"]:
+        return f"no, {servo['reason']}"
+    steps, substeps = servo["settle_steps"], servo["substeps"]
+    if steps is None:
+        return "yes, but the servos do not come within 1 % of where they are told: stiffen them, or compensate gravity"
+    if steps > substeps:
+        return (
+            f"yes, but the servos take {steps} physics steps to come within 1 % of where they are told, and a control "
+            f"step has substeps = {substeps}"
+        )
+    return f"yes, the servos come within 1 % of where they are told in {steps} physics steps (substeps = {substeps})"
+
+
+def _as_json(arm: Arm, dynamics: dict[str, dict[str, Any]]) -> dict[str, Any]:
     base, position, rotation = arm.base
     columns = (arm.joint_names, arm.slides, arm.continuous, arm.lower, arm.upper, arm.actuation)
     return {
@@ -92,7 +111,7 @@ def _as_json(arm: Arm, refused: dict[str, str]) -> dict[str, Any]:
             }
             for name, slides, endless, lower, upper, actuator in zip(*columns, strict=True)
         ],
-        "dynamics": {dynamics: {"works": not reason, "reason": reason or None} for dynamics, reason in refused.items()},
+        "dynamics": dynamics,
     }
 
 
