@@ -241,9 +241,8 @@ class Arm:
         base, position, rotation = self.base
         angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
         if angle > 0.1 or np.abs(position).max() > 1e-4:
-            title += (
-                f"; its base {base!r} stands at {point(position)}, turned by {angle:.0f} degrees, in the world frame"
-            )
+            turned = f", turned by {angle:.0f} degrees," if angle > 0.1 else ""
+            title += f"; its base {base!r} stands at {point(position)}{turned} in the world frame, that of all goals"
         return Table(title, ("joint", "kind", "from", "to", "unit", "actuator"), rows)
 
     def __repr__(self) -> str:

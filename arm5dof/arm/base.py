@@ -27,7 +27,7 @@ def hold_base(
     """
     bodies = [model.body(i).name for i in range(model.nbody)]
     if base not in bodies:
-        raise UserError(f"the model has no body {base!r} to be the base: {nearest_hint(base, filter(None, bodies))}")
+        raise UserError(f"the model has no body {base!r} to be the base: {nearest_hint(base, [*filter(None, bodies)])}")
     path = path_to(model, bodies.index(base))
     joints = [int(j) for j in joints_of(model, path)]
     if not joints:

@@ -87,7 +87,7 @@ def _place(model: mujoco.MjModel, kind: str, text: str) -> _Place:
     names = [(model.body(i) if bodies else model.geom(i)).name for i in range(model.nbody if bodies else model.ngeom)]
     if name not in names or not np.isfinite(offset).all():
         raise UserError(
-            f"the model has no {kind} {name!r} for an end effector: {nearest_hint(name, filter(None, names))}"
+            f"the model has no {kind} {name!r} for an end effector: {nearest_hint(name, [*filter(None, names)])}"
         )
     i = names.index(name)
     if bodies:
@@ -100,7 +100,7 @@ def _with_site(spec: mujoco.MjSpec | None, model: mujoco.MjModel, name: str, pla
     """The model with one more site."""
     if spec is None:
         raise UserError(
-            f"the end effector {name!r} is no site, and a compiled model can be given none: load it from its MJCF"
+            f"{name!r} is no site, and a compiled model can be given none: load it from its MJCF"
         )
     spec = spec.copy()
     body = next(body for body in spec.bodies if body.id == place.body)

@@ -47,8 +47,8 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = ""
     >>> from arm5dof import load_arm
     >>> load_arm("arm7.xml").dof
     7
-    >>> load_arm("arm7.xml", site="body link_7 0 0 0.1").reach
-    0.6
+    >>> round(load_arm("arm7.xml", site="body wrist 0 0 0.1").measured_reach, 6)
+    0.59
     >>> load_arm("arm7.xml", site="flange")
     Traceback (most recent call last):
     arm5dof.errors.UserError: the model has no site 'flange' to use as end effector; it has: ee; any place is 'body \

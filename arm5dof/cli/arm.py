@@ -118,15 +118,20 @@ def _as_json(arm: Arm, dynamics: dict[str, dict[str, Any]]) -> dict[str, Any]:
 def _draw(arm: Arm, path: Path) -> None:
     """Write a picture of the arm in the middle of its ranges."""
     import cv2
-    import jax.numpy as jnp
+    import mujoco
     import numpy as np
 
+    from arm5dof.arm.chain import path_to
     from arm5dof.vision.rendering.portrait import portrait
 
-    q = jnp.asarray(arm.home)
     qpos = arm.mj_model.qpos0.copy()
-    qpos[arm.qpos] = q
-    points = np.stack([*np.asarray(arm.joint_positions(q)), np.asarray(arm.forward(q)), arm.base[1]])
+    qpos[arm.qpos] = arm.home
+    data = mujoco.MjData(arm.mj_model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(arm.mj_model, data)
+    first = arm.mj_model.jnt_bodyid[arm.joints[0]]
+    bodies = [b for b in range(arm.mj_model.nbody) if first in path_to(arm.mj_model, b)]  # Its links, and its fingers.
+    points = np.stack([*data.xpos[bodies], data.site_xpos[arm.site], arm.base[1]])
     assert arm.mj_spec is not None  # It comes from a file.
     image = portrait(arm.mj_spec, qpos, points, arm.mj_model.site(arm.site).name)
     path.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())

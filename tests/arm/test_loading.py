@@ -75,7 +75,7 @@ def test_no_place_that_is_not_there():
     assert "no geom 'tip'" in said(lambda: load_arm(spec, "geom tip"))
     assert "no body 'tip 0 0'" in said(lambda: load_arm(spec, "body tip 0 0"))
     assert "no body 'tip'" in said(lambda: load_arm(spec, "body tip 0 0 nan"))
-    assert "compiled model can be given none" in said(lambda: load_arm(spec.compile(), "body tip"))
+    assert "a compiled model can be given none" in said(lambda: load_arm(spec.compile(), "body tip"))
     assert "no joint moves the site 'body car'" in said(lambda: load_arm(spec, "body car"))
     assert "no joint moves the site 'body upper' away" in said(lambda: load_arm(spec, "body upper"))
 
@@ -315,7 +315,7 @@ def test_where_the_base_stands_in_the_world_frame_of_all_goals_is_said():
     for pose, words in (
         (
             'pos="1 .5 .8" euler="0 0 90"',
-            "base 'car' stands at (1, 0.5, 0.8) m, turned by 90 degrees, in the world frame",
+            "base 'car' stands at (1, 0.5, 0.8) m, turned by 90 degrees, in the world frame, that of",
         ),
         ('pos="0 0 0"', ""),
     ):
