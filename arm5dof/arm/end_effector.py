@@ -99,9 +99,7 @@ def _place(model: mujoco.MjModel, kind: str, text: str) -> _Place:
 def _with_site(spec: mujoco.MjSpec | None, model: mujoco.MjModel, name: str, place: _Place, why: str) -> EndEffector:
     """The model with one more site."""
     if spec is None:
-        raise UserError(
-            f"{name!r} is no site, and a compiled model can be given none: load it from its MJCF"
-        )
+        raise UserError(f"{name!r} is no site, and a compiled model can be given none: load it from its MJCF")
     spec = spec.copy()
     body = next(body for body in spec.bodies if body.id == place.body)
     body.add_site(name=name, pos=place.position, quat=place.quaternion)

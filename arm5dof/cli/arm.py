@@ -50,13 +50,14 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     from arm5dof.arm.settling import settle_steps
 
     arm = load_arm(args.file, args.site, args.base)
+    if not args.json:
+        print(arm.table().text(), flush=True)  # MJX takes its time with a robot that has many contacts.
     dynamics = {name: _try(args, name) for name in ("kinematic", "servo")}
     steps = settle_steps(arm) if dynamics["servo"]["works"] else None
     dynamics["servo"]["settle_steps"] = steps
     if args.json:
         print(json.dumps(_as_json(arm, dynamics)))
     else:
-        print(arm.table().text())
         print(f"kinematic dynamics: {'yes' if dynamics['kinematic']['works'] else dynamics['kinematic']['reason']}")
         print(f"servo dynamics: {_servos(dynamics['servo'])}")
     if args.figure is not None:
