@@ -100,7 +100,7 @@ def test_folders_may_be_text(tmp_path):
 def test_objects_show_themselves_as_tables(arm: Arm, tmp_path):
     run = Run.create(load_config("kinematic.toml"), tmp_path / "run")
     for shown, words in (
-        (arm, ["Arm of 5 joints", "theta_3", "hinge", "from (deg, mm)"]),
+        (arm, ["Arm of 5 joints", "theta_3", "hinge", "position"]),
         (run, [f"Run {tmp_path / 'run'}, task reach", "episodes", "metric"]),
     ):
         text, html = repr(shown), shown._repr_html_()

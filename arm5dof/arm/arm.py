@@ -11,6 +11,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from arm5dof.arm.actuators import actuation
+from arm5dof.arm.chain import Link, joint_name
+from arm5dof.arm.workspace import measure_reach
 from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
 
@@ -26,14 +29,6 @@ class Pose(NamedTuple):
 
     position: jax.Array
     rotation: jax.Array
-
-
-class Link(NamedTuple):
-    """A constant transform, then a joint that turns about or slides along z."""
-
-    slides: bool
-    rotation: np.ndarray
-    offset: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,11 +62,18 @@ class Arm:
     """Id of the end-effector site."""
     lower: np.ndarray
     upper: np.ndarray
-    """Joint limits, (dof,), narrowed to what the position actuators can be told."""
+    """Joint limits, (dof,), narrowed to what the position actuators can be told; a turn where there are none."""
+    continuous: tuple[bool, ...]
+    """Which joints are hinges without limits, whose position is an angle modulo a turn, (dof,)."""
     chain: tuple[Link, ...]
     """What stands between the joints, (dof + 1,): the last leads from the last joint to the site."""
     reach: float
-    """An upper bound on the distance between the first joint and the end effector, metres."""
+    """An upper bound on the distance between the first joint and the end effector, metres: the scale in which networks
+    see points. How far it is really is `measured_reach`."""
+    why_site: str
+    """Why this site is the end effector, if none was named; else empty."""
+    held: tuple[str, ...]
+    """Names of the joints that were taken out to hold the base."""
 
     @cached_property
     def mjx_model(self) -> mjx.Model:
@@ -81,8 +83,9 @@ class Arm:
         try:
             with jax.ensure_compile_time_eval():  # It may be wanted first while a program is traced.
                 return mjx.put_model(self.mj_model)
-        except NotImplementedError as error:
-            raise UserError(f"MJX cannot simulate this model ({error}): change it, or use kinematic dynamics") from None
+        except Exception as error:  # NotImplementedError mostly, or whatever MJX's own code runs into.
+            change = 'give such geoms contype="0" conaffinity="0"' if "collisions" in str(error) else "change it"
+            raise UserError(f"MJX cannot simulate this model ({error}): {change}, or use kinematic dynamics") from None
 
     @property
     def dof(self) -> int:
@@ -92,7 +95,7 @@ class Arm:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints, (dof,); `joint_<id>` where the MJCF gives none."""
-        return tuple(self.mj_model.joint(int(j)).name or f"joint_{j}" for j in self.joints)
+        return tuple(joint_name(self.mj_model, int(j)) for j in self.joints)
 
     @property
     def slides(self) -> tuple[bool, ...]:
@@ -107,9 +110,25 @@ class Arm:
     @property
     def origin(self) -> np.ndarray:
         """The first joint's anchor in the world frame, (3,)."""
-        data = mujoco.MjData(self.mj_model)
-        mujoco.mj_kinematics(self.mj_model, data)
-        return data.xanchor[self.joints[0]].copy()
+        return self._at_rest().xanchor[self.joints[0]].copy()
+
+    @property
+    def base(self) -> tuple[str, np.ndarray, np.ndarray]:
+        """The body on which the first joint stands: its name, and its position (3,) in metres and rotation (3, 3) in
+        the world frame."""
+        body = self.mj_model.body_parentid[self.mj_model.jnt_bodyid[self.joints[0]]]
+        data = self._at_rest()
+        return self.mj_model.body(body).name, data.xpos[body].copy(), data.xmat[body].reshape(3, 3).copy()
+
+    @cached_property
+    def measured_reach(self) -> float:
+        """The furthest that the end effector gets from `origin`, metres, by search over the joints' ranges."""
+        return measure_reach(self.chain, self.lower, self.upper)
+
+    @property
+    def actuation(self) -> tuple[str, ...]:
+        """What drives each joint, (dof,): `position`, `velocity`, `motor`, `intvelocity`, ..., `none`."""
+        return tuple(actuation(self.mj_model, int(j)) for j in self.joints)
 
     def forward(self, q: jax.Array) -> jax.Array:
         """Position of the end-effector site, (..., 3), at joint positions `q` (..., dof). Differentiable."""
@@ -132,6 +151,11 @@ class Arm:
         from."""
         joints = self._joints(q)
         return jnp.stack([self._point(joints, k) for k in range(self.dof)], axis=-2)
+
+    def _at_rest(self) -> mujoco.MjData:
+        data = mujoco.MjData(self.mj_model)
+        mujoco.mj_kinematics(self.mj_model, data)
+        return data
 
     def _check(self, name: str, values: Any) -> None:
         """Raise `UserError` if an array's last axis does not have a number for each joint."""
@@ -196,24 +220,36 @@ class Arm:
         """Joint positions drawn uniformly inside the limits, shape + (dof,), float32."""
         return self.to_joints(jax.random.uniform(key, (*shape, self.dof), minval=-1.0, maxval=1.0))
 
-    def _table(self) -> Table:
-        limits = np.stack([self.lower, self.upper], axis=1) * np.where(self.slides, 1e3, 180 / np.pi)[:, None]
-        rows = [
-            (name, "slide" if slides else "hinge", f"{low:.1f}", f"{high:.1f}", "yes" if actuator >= 0 else "no")
-            for name, slides, (low, high), actuator in zip(
-                self.joint_names, self.slides, limits, self.actuators, strict=True
-            )
-        ]
-        title = (
-            f"Arm of {self.dof} joints, end effector {self.mj_model.site(self.site).name!r}, reach {self.reach:.3f} m"
-        )
-        return Table(title, ("joint", "kind", "from (deg, mm)", "to (deg, mm)", "position actuator"), rows)
+    def table(self) -> Table:
+        """The end effector, the reach, and the joints with their limits and what drives them."""
+        rows = []
+        for name, slides, endless, limits, driver in zip(
+            self.joint_names,
+            self.slides,
+            self.continuous,
+            np.stack([self.lower, self.upper], axis=1),
+            self.actuation,
+            strict=True,
+        ):
+            kind = "slide" if slides else "continuous" if endless else "hinge"
+            low, high = limits * (1e3 if slides else 180 / np.pi)
+            rows.append((name, kind, f"{low:.1f}", f"{high:.1f}", "mm" if slides else "deg", driver))
+        end = f"end effector {self.mj_model.site(self.site).name!r}" + (f" ({self.why_site})" if self.why_site else "")
+        held = f", {', '.join(self.held)} held" if self.held else ""
+        point = lambda p: f"({', '.join(f'{round(float(v), 4) + 0.0:g}' for v in p)}) m"
+        title = f"Arm of {self.dof} joints{held}, {end}, reach {self.measured_reach:.3f} m from {point(self.origin)}"
+        base, position, rotation = self.base
+        angle = np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+        if angle > 0.1 or np.abs(position).max() > 1e-4:
+            turned = f", turned by {angle:.0f} degrees," if angle > 0.1 else ""
+            title += f"; its base {base!r} stands at {point(position)}{turned} in the world frame, that of all goals"
+        return Table(title, ("joint", "kind", "from", "to", "unit", "actuator"), rows)
 
     def __repr__(self) -> str:
-        return self._table().text()
+        return self.table().text()
 
     def _repr_html_(self) -> str:
-        return self._table().html()
+        return self.table().html()
 
 
 @jax.custom_jvp

@@ -1,70 +1,86 @@
 """An MJCF read as an arm: which joints it has, what stands between them, and what servos them.
 
-The arm's joints are those on the way from the world to the body that carries the end-effector site. Whatever else the
-model holds (a gripper, a table, free objects) is left alone.
+The arm's joints are those on the way from the world, or from a base that is held, to the end effector. Whatever else
+the model holds (a gripper, other arms, a table, free objects) is left alone.
 """
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from arm5dof.arm.arm import Arm, Link
+from arm5dof.arm.actuators import position_actuator, servo_line
+from arm5dof.arm.arm import Arm
+from arm5dof.arm.base import hold_base
+from arm5dof.arm.chain import HINGE, SLIDE, fold, joint_name, joints_of, path_to
+from arm5dof.arm.end_effector import find_end_effector
+from arm5dof.arm.refusals import couplings, unfit_joints
+from arm5dof.arm.workspace import moves
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
 
-HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+FAR = 20.0
+"""Metres from which an arm's reach speaks for a model in millimetres."""
 
 
-def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = "ee") -> Arm:
+def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = "", base: str = "") -> Arm:
     """Load an arm.
 
     Args:
-        source: An MJCF file (the user's, or one that ships in `mjcf/`), an `MjSpec`, or a compiled `MjModel`.
-        site: Name of the site that is the end effector.
+        source: An MJCF or URDF file (the user's, or one that ships in `mjcf/`), an `MjSpec`, or a compiled `MjModel`.
+        site: The end effector: a site's name; `body NAME` or `geom NAME`, with or without an offset `X Y Z` in its
+            frame, metres; or nothing: the site `ee`, else what is named most like a tool, else the last link. The
+            model gets a site for what is none, unless it comes compiled.
+        base: A body that is held still, with all that carries it, where the MJCF has it: of an arm on a mobile or
+            free base. Nothing: the arm begins at the world.
+
+    Warns:
+        UserWarning: It reaches so far that its model is probably in millimetres.
 
     Raises:
-        UserError: The file is missing or broken, the site does not exist, or the joints between the world and the
-            site are not a chain of limited hinges and slides.
+        UserError: The file is missing or broken, there is no such end effector or base, or the joints between base
+            and end effector are not independent hinges and limited slides that move it.
 
     >>> from arm5dof import load_arm
     >>> load_arm("arm7.xml").dof
     7
+    >>> round(load_arm("arm7.xml", site="body wrist 0 0 0.1").measured_reach, 6)
+    0.59
     >>> load_arm("arm7.xml", site="flange")
     Traceback (most recent call last):
-    arm5dof.errors.UserError: the model has no site 'flange' to use as end effector; it has: ee
+    arm5dof.errors.UserError: the model has no site 'flange' to use as end effector; it has: ee; any place is 'body \
+NAME X Y Z'
     """
     spec, model = _compile(source)
-    names = [model.site(i).name for i in range(model.nsite)]
-    if site not in names:
-        raise UserError(f"the model has no site {site!r} to use as end effector; it has: {', '.join(names) or 'none'}")
-    site_id = names.index(site)
-
-    path: list[int] = []
-    body = model.site_bodyid[site_id]
-    while body:
-        path.insert(0, body)
-        body = model.body_parentid[body]
-    ids = np.array([j for b in path for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])])
+    spec, model, held = hold_base(spec, model, base) if base else (spec, model, ())
+    spec, model, site_id, why = find_end_effector(spec, model, site)
+    name = model.site(site_id).name
+    path = path_to(model, int(model.site_bodyid[site_id]))
+    if base and model.body(base).id not in path:
+        raise UserError(
+            f"the base {base!r} does not carry the end effector {name!r}: name a body between it and the world"
+        )
+    ids = joints_of(model, path)
     if not len(ids):
-        raise UserError(f"no joint moves the site {site!r}: it hangs on the world")
-    for j in ids:
-        name = model.joint(j).name
-        if model.jnt_type[j] not in (HINGE, SLIDE):
-            raise UserError(f"joint {name!r} is neither a hinge nor a slide: only serial arms of those can be trained")
-        if not model.jnt_limited[j]:
-            raise UserError(f'joint {name!r} has no limits: give it range="LOWER UPPER" in the MJCF')
+        raise UserError(f"no joint moves the site {name!r}: it hangs on {'the base' if held else 'the world'}")
+    if found := [*unfit_joints(model, ids), *couplings(model, ids)]:
+        raise UserError("; ".join(found))
 
     actuators = np.array([position_actuator(model, j) for j in ids])
     servo = np.array([servo_line(model, a) for a in actuators])
-    lower, upper = _limits(model, ids, actuators, servo)
-    chain = _chain(model, path, site_id)
+    lower, upper, continuous = _limits(model, ids, actuators, servo)
+    chain = fold(model, path, site_id)
+    if not moves(chain, lower, upper):
+        raise UserError(
+            f"no joint moves the site {name!r} away from where it is: choose an end effector beyond the joints"
+        )
     slides = ids[model.jnt_type[ids] == SLIDE]
     zero = model.qpos0[model.jnt_qposadr[slides]]
     travel = np.abs(model.jnt_range[slides] - zero[:, None]).max(-1, initial=0) + np.abs(zero)
-    return Arm(
+    arm = Arm(
         mj_model=model,
         mj_spec=spec,
         joints=ids,
@@ -75,96 +91,39 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = "e
         site=site_id,
         lower=lower,
         upper=upper,
+        continuous=continuous,
         chain=chain,
         reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + travel.sum()),
+        why_site=why,
+        held=held,
     )
-
-
-def _chain(model: mujoco.MjModel, path: list[int], site: int) -> tuple[Link, ...]:
-    """Everything between one joint's frame and the next, folded into one constant transform each. A joint's frame
-    has its origin in the anchor and its z axis along the joint's axis."""
-    links: list[Link] = []
-    rotation, offset = np.eye(3), np.zeros(3)
-
-    def move(by_rotation: np.ndarray, by_offset: np.ndarray) -> None:
-        nonlocal rotation, offset
-        rotation, offset = rotation @ by_rotation, offset + rotation @ by_offset
-
-    for body in path:
-        move(np.eye(3), model.body_pos[body])
-        move(_matrix(model.body_quat[body]), np.zeros(3))
-        first = model.body_jntadr[body]
-        for j in range(first, first + model.body_jntnum[body]):
-            slides = bool(model.jnt_type[j] == SLIDE)
-            align, anchor = _z_towards(model.jnt_axis[j]), model.jnt_pos[j]
-            zero = model.qpos0[model.jnt_qposadr[j]]
-            move(align, anchor)
-            links.append(Link(slides, _clean(rotation), _clean(offset)))
-            rotation, offset = np.eye(3), np.zeros(3)
-            move(np.eye(3), np.array([0, 0, -zero])) if slides else move(_about_z(-zero), np.zeros(3))
-            move(align.T, -align.T @ anchor)
-    move(np.eye(3), model.site_pos[site])
-    move(_matrix(model.site_quat[site]), np.zeros(3))
-    return (*links, Link(False, _clean(rotation), _clean(offset)))
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
-
-
-def _about_z(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-
-
-def _z_towards(axis: np.ndarray) -> np.ndarray:
-    """A rotation that takes the z axis to `axis`, a unit vector."""
-    quaternion = np.empty(4)
-    mujoco.mju_quatZ2Vec(quaternion, axis)
-    return _matrix(quaternion)
-
-
-def _clean(constants: np.ndarray) -> np.ndarray:
-    """Constants with rounding errors about 0 and +-1 removed, so that the terms vanish from the program."""
-    nearest = np.round(constants)
-    return np.where(np.abs(constants - nearest) < 1e-14, nearest, constants)
-
-
-def position_actuator(model: mujoco.MjModel, joint: int) -> int:
-    """Id of the actuator that servoes a joint's position, or -1."""
-    for a in range(model.nu):
-        on_joint = model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT) and model.actuator_trnid[a, 0] == joint
-        # A velocity servo has an affine bias too, but none that grows with position.
-        affine = model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        if on_joint and affine and model.actuator_biasprm[a, 1] and model.actuator_gainprm[a, 0]:
-            return a
-    return -1
-
-
-def servo_line(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
-    """Slope and offset of the control that holds a position actuator's joint at q: there gain * control + bias_0 +
-    bias_1 * gear * q vanishes."""
-    if actuator < 0:
-        return 1.0, 0.0
-    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator]
-    return -bias[1] * model.actuator_gear[actuator, 0] / gain, -bias[0] / gain
+    if arm.reach > FAR and arm.measured_reach > FAR:
+        warnings.warn(f"units? the arm reaches {arm.measured_reach:.0f} m: MJCF and URDF are in metres", stacklevel=2)
+    return arm
 
 
 def _limits(
     model: mujoco.MjModel, ids: np.ndarray, actuators: np.ndarray, servo: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The joints' ranges where their actuators' control ranges allow them. Raises `UserError` if nothing is left."""
+) -> tuple[np.ndarray, np.ndarray, tuple[bool, ...]]:
+    """The joints' ranges where their actuators' control ranges allow them, and which of them are whole turns of a
+    hinge without limits. Raises `UserError` if nothing is left."""
     lower, upper = model.jnt_range[ids].T.copy()
+    continuous = []
     for k, a in enumerate(actuators):
+        endless = model.jnt_type[ids[k]] == HINGE and not model.jnt_limited[ids[k]]
+        if endless:
+            lower[k], upper[k] = -np.pi, np.pi
         if a >= 0 and model.actuator_ctrllimited[a]:
             told = np.sort((model.actuator_ctrlrange[a] - servo[k, 1]) / servo[k, 0])
+            if endless:  # The turn next to -pi to pi that the actuator can be told.
+                shift = np.clip(0, *np.sort([told[0] + np.pi, told[1] - np.pi]))
+                lower[k], upper[k] = shift - np.pi, shift + np.pi
             lower[k], upper[k] = max(lower[k], told[0]), min(upper[k], told[1])
         if not lower[k] < upper[k]:
-            name = model.joint(ids[k]).name
+            name = joint_name(model, ids[k])
             raise UserError(f"joint {name!r} cannot move: its range and its actuator's ctrlrange leave nothing")
-    return lower, upper
+        continuous.append(bool(endless and upper[k] - lower[k] > 2 * np.pi - 1e-9))
+    return lower, upper, tuple(continuous)
 
 
 def _compile(source: str | Path | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:
@@ -181,6 +140,8 @@ def _compile(source: str | Path | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoc
         raise UserError(f"no MJCF file {str(source)!r}: give a path, or one of those shipped: {names}")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        if path.suffix.lower() == ".urdf":  # Links without a joint of their own are the frames that people name.
+            spec.compiler.fusestatic = False
         return spec, spec.compile()
     except ValueError as error:
         raise UserError(f"MuJoCo cannot read {path}: {error}") from None

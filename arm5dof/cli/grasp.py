@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arm5dof.cli.joints import by_unit, for_people
 from arm5dof.cli.parser import natural, nothing_left, positive
 from arm5dof.errors import UserError
 
@@ -178,7 +178,7 @@ def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, floa
     commands = [
         {
             "time_s": round(one.time, 3),
-            "joints_rad": dict(zip(arm.joint_names, map(float, one.joints), strict=True)),
+            **by_unit(arm.joint_names, arm.slides, one.joints),
             "opening_m": one.opening,
         }
         for one in robot.commands
@@ -186,8 +186,9 @@ def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, floa
     if args.json:
         print(json.dumps(commands))
     else:
-        print("  time  opening  " + "  ".join(f"{name:>12}" for name in arm.joint_names))
+        print("  time  opening  " + "  ".join(f"{name:>12}" for name in arm.joint_names) + "  (degrees, slides mm)")
         for one in robot.commands:
-            angles = "  ".join(f"{math.degrees(q):12.2f}" for q in one.joints)
-            print(f"{one.time:5.2f} s {1e3 * one.opening:5.1f} mm  {angles}")
+            pairs = zip(arm.slides, map(float, one.joints), strict=True)
+            shown = "  ".join(f"{for_people(*pair)[0]:12.2f}" for pair in pairs)
+            print(f"{one.time:5.2f} s {1e3 * one.opening:5.1f} mm  {shown}")
     return 0

@@ -1,4 +1,4 @@
-"""The command line: `arm5dof train | eval | solve | export | sweep | compare | grasp | vision`.
+"""The command line: `arm5dof arm | train | eval | solve | export | sweep | compare | grasp | vision`.
 
 Declaring commands must be quick, so whatever takes JAX, MuJoCo or OpenCV is imported where it is used.
 """
@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Sequence
 
 from arm5dof import __version__
-from arm5dof.cli import compare, evaluate, export, grasp, solve, sweep, train, vision
+from arm5dof.cli import arm, compare, evaluate, export, grasp, solve, sweep, train, vision
 from arm5dof.cli.parser import Parser
 from arm5dof.errors import UserError
 
@@ -44,6 +44,7 @@ def make_parser() -> Parser:
     parser = Parser(prog="arm5dof", description="Train and ask vision-guided robot arms in JAX and MJX.")
     parser.add_argument("--version", action="version", version=f"arm5dof {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
+    arm.declare(commands)
     train.declare(commands)
     evaluate.declare(commands)
     solve.declare(commands)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arm5dof.cli.joints import by_unit
 from arm5dof.cli.parser import Parser, natural, nothing_left
 from arm5dof.errors import UserError
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 HELP = """\
 Ask a trained policy for joint angles.
 
-  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the world frame
+  arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the world frame of the MJCF
   arm5dof solve runs/reach --target 0.1 0 0.2 --target ...  several
   arm5dof solve runs/reach --csv points.csv --out answers.csv
   arm5dof solve runs/reach --help                           how a goal is stated to this run's policy
@@ -89,7 +90,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     rows: list[dict[str, Any]] = [
         {
             **{_key(name): values[i] for name, values in inputs.items()},
-            **_joints(model, answer.q[i].tolist()),
+            **by_unit(model.joint_names, model.slides, answer.q[i]),
             **{f"error_{units[name].unit}": values[i] for name, values in errors.items()},
         }
         for i in range(len(answer.q))
@@ -110,14 +111,6 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
             f"{reached.count(False)} of {len(rows)} targets not reached within {limits}: ({point}) m is missed by "
             f"{errors[name][worst]:.1f} {units[name].unit}; {model.workspace}"
         )
-
-
-def _joints(model: ForwardModel, q: list[float]) -> dict[str, dict[str, float]]:
-    """Joint positions by name: those of hinges in radians, and those of slides, where there are any, in metres."""
-    named = list(zip(model.joint_names, q, model.slides, strict=True))
-    slides = {name: value for name, value, slides in named if slides}
-    hinges = {name: value for name, value, slides in named if not slides}
-    return {"joints_rad": hinges} | ({"joints_m": slides} if slides else {})
 
 
 def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:

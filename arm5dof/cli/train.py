@@ -23,7 +23,9 @@ a folder with its configuration, its robot, metrics, checkpoints, a figure and r
   arm5dof train                                     the default experiment, into runs/reach
   arm5dof train kinematic.toml --seed 1 --out DIR   another one, another seed, into DIR
   arm5dof train reach_pose.toml                     points and directions: which way the tool points
-  arm5dof train --arm my_arm.xml --site tool0       your own arm
+  arm5dof train --arm my_arm.xml                    your own arm; arm5dof arm my_arm.xml shows how it is read
+  arm5dof train --arm my_arm.xml --site "body hand 0 0 0.1"   with the end effector 0.1 m along z from a body
+  arm5dof train --arm rover.xml --base chassis      an arm on a base that stands still
   arm5dof train my.toml                             your own task: [env] task = "my_module:MyTask"
   arm5dof train --smoke                             a minute on a laptop, to see that everything works
   arm5dof train --resume runs/reach                 go on with a run that was stopped
@@ -103,6 +105,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         # What is wrong with the robot or the budget is said before a folder exists.
         trainer = loop.make_trainer(settings)
         current = runs.Run.create(settings, out, trainer.env)
+        print(trainer.env.about, end="\n" if trainer.env.about else "", file=sys.stderr)
     print(f"run {current.folder} on {runs.device()}", file=sys.stderr)
     try:
         with Bar("training", current.config.train.episodes, "episodes") as bar:

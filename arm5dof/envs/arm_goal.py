@@ -32,9 +32,12 @@ class ArmGoalConfig:
     """Settings of every task of bringing an arm's end effector somewhere."""
 
     arm: str = static(default="reach.xml")
-    """MJCF file with the arm: a path, or the name of one that ships with the package."""
-    site: str = static(default="ee")
-    """The end effector: a site in that file."""
+    """MJCF or URDF file with the arm: a path, or the name of one that ships with the package."""
+    site: str = static(default="")
+    """The end effector: a site in that file, or a place on a body or geom: "body hand 0 0 0.1" (metres, in its frame).
+    Empty: the site ee, else what is named most like a tool, else the last link."""
+    base: str = static(default="")
+    """A body of that file that is held still, with all that carries it: of an arm on a mobile or free base."""
     dynamics: Literal["servo", "kinematic"] = static(default="servo")
     """servo: an action is the position actuators' target and MJX physics moves the arm there; kinematic: an action
     is the pose itself, the paper's setting."""
@@ -57,8 +60,8 @@ class ArmGoalEnv(Task):
     """A `ForwardModel`: pure `reset(key)` and `step(state, action)`, no batch axis.
 
     Observations are dimensionless: points are relative to the arm's origin in units of its reach, joint positions in
-    units of half their range ([-1, 1]). The actor sees the goal; the critic's `privileged_state` is the paper's: joint
-    angles, what is achieved, the goal.
+    units of half their range ([-1, 1]), and for joints without limits cosines, then sines. The actor sees the goal; the
+    critic's `privileged_state` is the paper's: joint angles, what is achieved, the goal.
     """
 
     config: ArmGoalConfig
@@ -73,13 +76,17 @@ class ArmGoalEnv(Task):
             UserError: There is no such arm, or a joint has no position actuator and the dynamics need one.
         """
         super().__init__(config)
-        self.arm = arm if isinstance(arm, Arm) else load_arm(config.arm if arm is None else arm, config.site)
-        arm = self.arm
+        loaded = arm if isinstance(arm, Arm) else load_arm(config.arm if arm is None else arm, config.site, config.base)
+        self.arm = arm = loaded
         if config.dynamics == "servo" and (arm.actuators < 0).any():
-            name = arm.joint_names[(arm.actuators < 0).argmax()]
+            lacking = [repr(name) for name, a in zip(arm.joint_names, arm.actuators, strict=True) if a < 0]
+            drivers = sorted({d for d, a in zip(arm.actuation, arm.actuators, strict=True) if a < 0})
             raise UserError(
-                f'joint {name!r} has no position actuator: add one to the MJCF, or choose dynamics = "kinematic"'
+                f"joint {', '.join(lacking)} has no position actuator (but {', '.join(drivers)}): add one to the MJCF, "
+                'or choose dynamics = "kinematic"'
             )
+        endless = np.array(arm.continuous)
+        self._limited, self._endless = np.flatnonzero(~endless), np.flatnonzero(endless)
         self._origin = arm.origin
         body = mujoco.mj_name2id(arm.mj_model, mujoco.mjtObj.mjOBJ_BODY, "target")
         self._marker = int(arm.mj_model.body_mocapid[body]) if body >= 0 else -1
@@ -159,7 +166,12 @@ class ArmGoalEnv(Task):
     def check(self) -> None:
         """Raise `UserError` if MJX is to simulate the arm and cannot."""
         if self.config.dynamics == "servo":
-            _ = self.arm.mjx_model
+            Physics.check(self.arm.mj_model, self.arm.mjx_model)
+
+    @property
+    def about(self) -> str:
+        """See `Task`: the arm."""
+        return self.arm.table().text()
 
     def reset(self, key: jax.Array) -> State:
         """A random pose and a fresh, reachable goal: forward kinematics of another random pose."""
@@ -197,7 +209,7 @@ class ArmGoalEnv(Task):
 
     def achieved(self, obs: Observation) -> Goal:
         """What the end effector has reached."""
-        n = self.arm.dof
+        n = self.arm.dof + len(self._endless)
         size = (len(obs["privileged_state"]) - n) // 2
         return self.decode(obs["privileged_state"][n : n + size])
 
@@ -239,7 +251,7 @@ class ArmGoalEnv(Task):
     @property
     def workspace(self) -> str:
         origin = ", ".join(f"{v:g}" for v in self.arm.origin)
-        return f"the arm reaches {self.arm.reach:.3f} m from ({origin}) m"
+        return f"the arm reaches {self.arm.measured_reach:.3f} m from ({origin}) m"
 
     def question(self, goal: Goal) -> Observation:
         """See `ForwardModel`: asked from the arm's home pose."""
@@ -258,7 +270,7 @@ class ArmGoalEnv(Task):
         difference between the two."""
         achieved = self.encode(self.outcome(action))
         target = obs["privileged_state"][-len(achieved) :]
-        return jnp.concatenate([action, achieved, target, achieved - target])
+        return jnp.concatenate([self._seen(action), achieved, target, achieved - target])
 
     # Accuracy.
 
@@ -317,7 +329,7 @@ class ArmGoalEnv(Task):
         """The observation, and what the end effector has reached."""
         pose = data.qpos[self.arm.qpos]
         achieved = self.forward(pose)
-        q, there, target = self.arm.to_action(pose), self.encode(achieved), self.encode(goal)
+        q, there, target = self._seen(self.arm.to_action(pose)), self.encode(achieved), self.encode(goal)
         obs = {
             "state": self._actor_observation(data, q, there, target),
             "privileged_state": jnp.concatenate([q, there, target]),
@@ -327,6 +339,13 @@ class ArmGoalEnv(Task):
     def _actor_observation(self, data: Physics, q: jax.Array, there: jax.Array, target: jax.Array) -> jax.Array:
         """What the actor sees: of the physics, of scaled joint positions, and of what is achieved and wanted."""
         return target
+
+    def _seen(self, action: jax.Array) -> jax.Array:
+        """Joint positions as networks see them, from those in units of half their range: a turn further is the same."""
+        if not len(self._endless):
+            return action
+        angle = jnp.pi * action[self._endless]
+        return jnp.concatenate([action[self._limited], jnp.cos(angle), jnp.sin(angle)])
 
     def _scaled(self, points: jax.Array) -> jax.Array:
         """Points (..., 3) relative to the arm's origin, in units of its reach."""

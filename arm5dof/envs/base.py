@@ -147,6 +147,11 @@ class Task(ABC):
         """Raise `UserError` if the environment cannot be simulated."""
 
     @property
+    def about(self) -> str:
+        """What people should know of it before a training, lines of text: which robot it is, and how it was read."""
+        return ""
+
+    @property
     def fingerprint(self) -> tuple[object, ...] | None:
         """All that the environment's functions depend on but this package's source, so that its compiled programs can
         be found again; None if that is not known."""

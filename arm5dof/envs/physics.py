@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
+from arm5dof.errors import UserError
+
 if TYPE_CHECKING:
     from mujoco import mjx
 
@@ -31,6 +33,17 @@ class Physics(struct.PyTreeNode):
         """The model's initial state."""
         data = mujoco.MjData(model)
         return Physics(**{name: jnp.asarray(getattr(data, name), jnp.float32) for name in FIELDS})
+
+    @staticmethod
+    def check(model: mujoco.MjModel, mjx_model: mjx.Model) -> None:
+        """Raise `UserError` if MJX has the model but cannot step it."""
+        try:
+            jax.eval_shape(lambda: Physics.at_rest(model).step(mjx_model))
+        except Exception as error:  # MJX raises whatever its own code runs into.
+            elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+            change = 'set <option cone="pyramidal"/>' if elliptic else "change it"
+            said = f"{type(error).__name__}: {error}".partition("\n")[0]
+            raise UserError(f"MJX cannot step this model ({said}): {change}, or use kinematic dynamics") from error
 
     def step(self, model: mjx.Model) -> Physics:
         """One step of `mjx.step`."""

@@ -8,7 +8,8 @@ from functools import cache
 import mujoco
 import numpy as np
 
-from arm5dof.arm.loading import SLIDE, position_actuator, servo_line
+from arm5dof.arm.actuators import position_actuator, servo_line
+from arm5dof.arm.chain import SLIDE, joint_name
 from arm5dof.errors import UserError
 from arm5dof.vision.objects import CatalogueObject
 
@@ -66,7 +67,7 @@ class Gripper:
             )
         actuators = np.array([position_actuator(model, j) for j in joints])
         if (actuators < 0).any():
-            name = model.joint(joints[int(actuators.argmin())]).name
+            name = joint_name(model, joints[int(actuators.argmin())])
             raise UserError(f"finger {name!r} has no position actuator: give it one")
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0

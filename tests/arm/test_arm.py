@@ -92,7 +92,7 @@ def test_mjcf_is_table_1(arm: Arm):
 def test_reach_is_the_longest_stretch(arm: Arm):
     position = np.asarray(arm.forward(jnp.asarray(random_poses(arm, 20_000))))
     distance = np.linalg.norm(position - arm.origin, axis=1)
-    assert 0.97 * arm.reach < distance.max() <= arm.reach
+    assert 0.97 * arm.reach < distance.max() <= arm.measured_reach + 1e-6 < arm.reach
 
 
 # Any arm
@@ -220,7 +220,7 @@ def test_gears_gains_and_control_ranges_of_the_servos_are_respected():
 
 ARM = """<mujoco><worldbody><body name="a">{joint}<geom size=".1"/>
     <body name="b"><joint name="tip" range="-1 1"/><geom size=".1"/>{site}</body></body></worldbody></mujoco>"""
-GOOD, EE = '<joint name="base" range="-1 1"/>', '<site name="ee"/>'
+GOOD, EE = '<joint name="base" range="-1 1"/>', '<site name="ee" pos="1 0 0"/>'
 
 
 @pytest.mark.parametrize(
@@ -231,12 +231,11 @@ GOOD, EE = '<joint name="base" range="-1 1"/>', '<site name="ee"/>'
         ("", "cannot read"),
         ('<mujoco><include file="absent.xml"/></mujoco>', "cannot read"),
         ('<mujoco><worldbody><body name="a"><joint range="-1 1"/></body></worldbody></mujoco>', "cannot read"),
-        (ARM.format(joint=GOOD, site='<site name="tool"/><site name="other"/>'), "it has: tool, other"),
-        (ARM.format(joint=GOOD, site=""), "it has: none"),
-        (ARM.format(joint='<joint name="base"/>', site=EE), "joint 'base' has no limits"),
         (ARM.format(joint='<joint name="base" type="ball"/>', site=EE), "joint 'base' is neither a hinge nor a slide"),
         (ARM.format(joint='<freejoint name="base"/>', site=EE), "joint 'base' is neither a hinge nor a slide"),
+        (ARM.format(joint='<joint name="base" type="slide"/>', site=EE), "slide 'base' has no limits"),
         ('<mujoco><worldbody><site name="ee"/></worldbody></mujoco>', "no joint moves the site 'ee'"),
+        ("<mujoco/>", "no joints"),
     ],
 )
 def test_bad_arms_are_refused_in_one_line(tmp_path: Path, xml: str, words: str):

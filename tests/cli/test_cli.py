@@ -178,7 +178,7 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
     assert "not finite" in fails("solve", trained, "--target", "nan", 0, 0)
     assert "not finite" in fails("solve", trained, "--target", 0, "inf", 0)
     said = fails("solve", trained, "--target", 1, 0, 0)
-    assert "1 of 1 targets not reached" in said and "reaches 0.268 m" in said
+    assert "1 of 1 targets not reached" in said and "reaches 0.267 m" in said
     assert "either" in fails("solve", trained)
     assert "expected 3 arguments" in fails("solve", trained, "--target", 1, 2)
     for name, text, expected in [
@@ -233,17 +233,17 @@ def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
     for name, text, said in [
         ("broken.xml", "<mujoco><worldbody>", "cannot read"),
         ("unknown.xml", "<mujoco><nonsense/></mujoco>", "cannot read"),
-        ("empty.xml", "<mujoco/>", "no site 'ee'"),
+        ("empty.xml", "<mujoco/>", "no joints"),
         (
             "unactuated.xml",
             "<mujoco><worldbody><body>"
-            '<joint name="a" range="-1 1"/><geom size="1"/><site name="ee"/></body></worldbody></mujoco>',
+            '<joint name="a" range="-1 1"/><geom size="1"/><site name="ee" pos="1 0 0"/></body></worldbody></mujoco>',
             "no position actuator",
         ),
         (
             "implicit.xml",
             '<mujoco><option integrator="implicit"/><worldbody><body><joint name="a" range="-1 1"/><geom size="1"/>'
-            '<site name="ee"/></body></worldbody><actuator><position joint="a"/></actuator></mujoco>',
+            '<site name="ee" pos="1 0 0"/></body></worldbody><actuator><position joint="a"/></actuator></mujoco>',
             "MJX cannot simulate this model",
         ),
     ]:

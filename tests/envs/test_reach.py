@@ -324,3 +324,43 @@ def test_seven_joints_without_a_marker():
         data = placed(arm, np.asarray(state.data.qpos[i, arm.qpos], float))
         expected = documented(env, data, np.asarray(state.info["goal"][i], float))
         assert_same_obs(jax.tree.map(lambda x, i=i: x[i], state.obs), expected)
+
+
+# Joints without limits
+
+
+SPINNING = """<mujoco><compiler angle="radian"/>{option}<worldbody><body>
+    <joint name="spin"/><geom size=".1" contype="0" conaffinity="0"/>
+    <body pos="0 0 .3"><joint name="bend" axis="0 1 0" range="-1 2"/><geom size=".1" contype="0" conaffinity="0"/>
+    <site name="ee" pos="0 0 .2"/></body></body></worldbody>
+    <actuator><position joint="spin"/><position joint="bend"/></actuator></mujoco>"""
+
+
+def test_networks_see_joints_without_limits_modulo_a_turn():
+    arm = load_arm(mujoco.MjSpec.from_string(SPINNING.format(option="")))
+    env = Reach(ReachConfig(dynamics="kinematic", observation="full"), arm)
+    goal = jnp.array([0.1, 0.0, 0.4])
+    here, round_about = (env.start(jnp.array([angle, 0.5]), goal) for angle in (0.7, 0.7 - 2 * np.pi))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), here.obs, round_about.obs)
+    np.testing.assert_allclose(here.obs["privileged_state"][:3], [0.0, np.cos(0.7), np.sin(0.7)], atol=1e-6)
+    np.testing.assert_allclose(env.achieved(here.obs), arm.forward(jnp.array([0.7, 0.5])), atol=1e-6)
+    other = jnp.array([0.0, 0.2, 0.3])
+    jax.tree.map(np.testing.assert_array_equal, env.replace_goal(here.obs, other), env.start(here.data.qpos, other).obs)
+    shown = env.critic_input(here.obs, jnp.array([0.7 / np.pi, 0.0]))
+    np.testing.assert_allclose(shown[:3], here.obs["privileged_state"][:3], atol=1e-6)
+    q = arm.sample(jax.random.key(0), (1000,))[:, 0]
+    assert q.min() < -3.1 and q.max() > 3.1
+
+
+def test_what_mjx_trips_over_is_said_before_it_is_trained():
+    for option, words in (
+        ("", None),
+        ('<option cone="elliptic"/>', r'MJX cannot step .*set <option cone="pyramidal"/>'),
+    ):
+        arm = load_arm(mujoco.MjSpec.from_string(SPINNING.format(option=option)))
+        env = Reach(ReachConfig(dynamics="servo"), arm)
+        if words is None:
+            env.check()
+        else:
+            with pytest.raises(UserError, match=words):
+                env.check()
