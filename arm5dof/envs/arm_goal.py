@@ -343,19 +343,3 @@ class CorrectionState(NamedTuple):
     asked: Goal
     best: Goal
     reward: jax.Array
-
-
-def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
-    """What people state, rows of finite numbers (n, k) or one (k,), as rows. Raises `UserError` for anything else."""
-    shape = f"{len(components)} numbers ({', '.join(components)}), or rows of them"
-    try:
-        array = np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise UserError(f"{name} takes {shape}, not {values!r}") from None
-    if array.ndim not in (1, 2) or array.shape[-1] != len(components) or not len(array):
-        raise UserError(f"{name} takes {shape}, not an array of shape {array.shape}")
-    rows = np.atleast_2d(array)
-    for i, row in enumerate(rows, 1):
-        if not np.isfinite(row).all():
-            raise UserError(f"{name} {i} is not finite: {' '.join(map(str, row.tolist()))}")
-    return rows
