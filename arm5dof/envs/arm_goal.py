@@ -277,8 +277,8 @@ class ArmGoalEnv(Task):
         goals = jax.vmap(self.sample_goal)(jax.random.split(goal_key, n))
         state = jax.vmap(self.start)(self.arm.sample(pose_key, (n,)), goals)
         kinds = {
-            "one_shot": solve(self, act, goals, 0).errors,
-            "refined": solve(self, act, goals, self.config.refinements).errors,
+            "one_shot": solve(self, act, goals, 0).answer.errors,
+            "refined": solve(self, act, goals, self.config.refinements).answer.errors,
             "episode": self._episode(act, state, goals),
             "initial": state.metrics,
         }
@@ -291,7 +291,7 @@ class ArmGoalEnv(Task):
     def watch(self, act: Act, key: jax.Array) -> dict[str, jax.Array]:
         """Mean errors of one answer to a few hundred goals, `policy_<component>`."""
         goals = jax.vmap(self.sample_goal)(jax.random.split(key, PROBES))
-        return {f"policy_{name}": values.mean() for name, values in solve(self, act, goals, 0).errors.items()}
+        return {f"policy_{name}": values.mean() for name, values in solve(self, act, goals, 0).answer.errors.items()}
 
     def _episode(self, act: Act, state: State, goals: Goal) -> dict[str, jax.Array]:
         branch = act.branch(state.obs)

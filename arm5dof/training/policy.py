@@ -86,7 +86,8 @@ class Policy(struct.PyTreeNode, eq=False):
             target: The first of the task's goal inputs, which for the tasks that ship is a point (3,), metres in the
                 world frame, or several, (n, 3).
             corrections: How often the policy is asked again for a goal shifted by the error it was seen to make
-                (closed-loop target correction). The best answer counts.
+                (closed-loop target correction). The best answer counts; where it misses, as it must out of reach, the
+                nearest that damped least squares finds, begun at all of the policy's answers and a few random ones.
             near: Joint positions (dof,), or (n, dof), radians (metres for slides): of all the actor's answers that are
                 within the smallest limits of the task's errors (1 mm, 0.5 degrees) the nearest to these counts.
             candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the
@@ -226,7 +227,8 @@ class Policy(struct.PyTreeNode, eq=False):
 @partial(jax.jit, static_argnames=("env", "corrections"))
 def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
-    return inverse_kinematics.solve(env, policy, goals, corrections)
+    found = inverse_kinematics.solve(env, policy, goals, corrections)
+    return (inverse_kinematics.nearest(env, policy, goals, found) if corrections else found).answer
 
 
 @partial(jax.jit, static_argnames=("env", "corrections", "branches"))

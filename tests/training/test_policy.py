@@ -172,8 +172,8 @@ def test_corrections_follow_several_branches(arm: Arm, followed: int):
         def branch(self, obs):
             return order[:, self.rank]
 
-    errors = np.stack([solve(single, Alone(rank), goals, 3).errors["distance"] for rank in range(followed)])
-    found = policy.solve(np.asarray(goals), corrections=3)
+    errors = np.stack([solve(single, Alone(rank), goals, 3).answer.errors["distance"] for rank in range(followed)])
+    found = solve(env, policy, goals, 3).answer
     np.testing.assert_allclose(found.errors["distance"], errors.min(0), atol=1e-6)
     assert (errors.argmin(0) > 0).any()
     every = policy.solve(np.asarray(goals), corrections=3, candidates=True)
@@ -181,7 +181,9 @@ def test_corrections_follow_several_branches(arm: Arm, followed: int):
     np.testing.assert_allclose(every.errors["distance"], errors.T, atol=1e-6)
     np.testing.assert_allclose(env.arm.forward(found.q), found.outcome, atol=1e-6)
     first = policy.solve(np.asarray(goals))
-    np.testing.assert_allclose(first.errors["distance"], solve(single, policy, goals, 0).errors["distance"], atol=1e-6)
+    np.testing.assert_allclose(
+        first.errors["distance"], solve(single, policy, goals, 0).answer.errors["distance"], atol=1e-6
+    )
 
 
 def test_a_policy_says_what_it_acts_on(policy: Policy):
