@@ -18,7 +18,10 @@ from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
     from arm5dof.envs import ForwardModel
+    from arm5dof.envs.inverse_kinematics import Answer
     from arm5dof.envs.metrics import Error
+    from arm5dof.envs.paths import Path as Line
+    from arm5dof.training.policy import Policy
 
 HELP = """\
 Ask a trained policy for joint angles.
@@ -26,11 +29,12 @@ Ask a trained policy for joint angles.
   arm5dof solve runs/reach --target 0.15 0.05 0.12          one target, metres in the world frame of the MJCF
   arm5dof solve runs/reach --target 0.1 0 0.2 --target ...  several
   arm5dof solve runs/reach --csv points.csv --out answers.csv
+  arm5dof solve runs/reach --csv line.csv --path            points of a line, along which no joint is to jump
   arm5dof solve runs/reach --help                           how a goal is stated to this run's policy
 
 A CSV has a header with x, y and z, and whatever else the run's task wants to know. Joint positions are radians, and
-metres for slides, in JSON and CSV, degrees and millimetres otherwise. Exit status 2 if a target is not reached within
-the tolerances.
+metres for slides, in JSON, CSV and --near, degrees and millimetres otherwise. Exit status 2 if a target is not reached
+within the tolerances, or a joint jumps along a --path.
 """
 
 Inputs = dict[str, Any]
@@ -52,6 +56,8 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.add_argument("--csv", type=Path, metavar="IN.csv", help="many targets")
     p.add_argument("--out", type=Path, metavar="OUT.csv", help="with --csv: where the answers go; default: printed")
     p.add_argument("--refine", type=natural, default=10, metavar="N", help="correct the target N times; default 10")
+    p.add_argument("--path", action="store_true", help="the targets are a line: keep one branch along it")
+    p.add_argument("--all", action="store_true", help="every distinct answer that reaches a target, the best first")
     p.add_argument("--json", action="store_true", help="print a JSON list")
     p.set_defaults(run=run, parser=p)
 
@@ -66,6 +72,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         raise UserError("name the run whose policy is to answer: arm5dof solve RUN --target X Y Z")
     if args.out is not None and args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
+    if args.path and args.all:
+        raise UserError("--path wants one answer to each target: leave out --all")
 
     from arm5dof.runtime import files
     from arm5dof.training.run import Run
@@ -84,7 +92,17 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     inputs = _inputs(args.csv, vars(more), model)
     tolerances = {name: getattr(more, f"tolerance_{unit.unit}") for name, unit in units.items()}
 
-    answer = policy.solve(corrections=args.refine, **inputs)
+    if args.all and more.near is not None:
+        raise UserError("--all gives every answer: leave out --near")
+    answer: Answer | Line
+    jumps: list[int] = []
+    if args.all:
+        inputs, answer = _every(policy, inputs, args.refine, tolerances)
+    elif args.path:
+        answer = policy.path(start=more.near, corrections=args.refine, **inputs)
+        jumps = answer.jumps.nonzero()[0].tolist()
+    else:
+        answer = policy.solve(near=more.near, corrections=args.refine, **inputs)
     errors = {name: [unit.scale * float(v) for v in answer.errors[name]] for name, unit in units.items()}
     reached = [all(errors[name][i] <= tolerances[name] for name in units) for i in range(len(answer.q))]
     rows: list[dict[str, Any]] = [
@@ -102,6 +120,12 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.csv is not None and not (args.json and args.out is None):
         text = _csv(rows, inputs, reached, model, units)
         sys.stdout.write(text) if args.out is None else files.write_text(args.out, text)
+    if jumps:
+        point = ", ".join(f"{v:g}" for v in next(iter(inputs.values()))[jumps[0]])
+        raise UserError(
+            f"{len(jumps)} jumps of a joint on the path, the first to ({point}) m: no branch that the policy "
+            "knows serves the whole line; divide it there, or give points that lie nearer to each other"
+        )
     if not all(reached):
         name = next(name for name in units if max(errors[name]) > tolerances[name])
         worst = max(range(len(rows)), key=lambda i: errors[name][i])
@@ -111,6 +135,24 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
             f"{reached.count(False)} of {len(rows)} targets not reached within {limits}: ({point}) m is missed by "
             f"{errors[name][worst]:.1f} {units[name].unit}; {model.workspace}"
         )
+
+
+def _every(policy: Policy, inputs: Inputs, refine: int, tolerances: Mapping[str, float]) -> tuple[Inputs, Answer]:
+    """Every distinct answer that reaches its goal, or the best where none does, and the goals of all answers."""
+    import jax
+    import numpy as np
+
+    units = policy.forward_model.components
+    stated: Inputs = {name: [] for name in inputs}
+    answers = []
+    for goal in zip(*inputs.values(), strict=True):
+        every = policy.solve_all(corrections=refine, **dict(zip(inputs, goal, strict=True)))
+        met = np.all([np.asarray(every.errors[n]) * units[n].scale <= tolerances[n] for n in units], axis=0)
+        rows = np.flatnonzero(met) if met.any() else np.array([0])
+        answers.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], every))
+        for name, values in zip(inputs, goal, strict=True):
+            stated[name] += [values] * len(rows)
+    return stated, jax.tree.map(lambda *parts: np.concatenate(parts), *answers)
 
 
 def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:
@@ -140,6 +182,9 @@ def _declare_goal(parser: argparse.ArgumentParser, model: ForwardModel, units: M
         default = unit.tolerance
         option, about = f"--tolerance-{unit.unit}", f"what counts as reached; default {default:g}"
         group.add_argument(option, type=float, default=default, metavar=unit.unit.upper(), help=about)
+    joints = model.joint_names
+    about = f"where the joints are ({', '.join(joints)}): the nearest answer, or with --path the start"
+    group.add_argument("--near", type=float, nargs=len(joints), metavar="Q", help=about)
 
 
 def _inputs(path: Path | None, given: Mapping[str, Any], model: ForwardModel) -> Inputs:

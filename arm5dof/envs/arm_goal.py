@@ -239,6 +239,10 @@ class ArmGoalEnv(Task):
         return self.arm.slides
 
     @property
+    def continuous(self) -> tuple[bool, ...]:
+        return self.arm.continuous
+
+    @property
     def branches(self) -> int:
         """See `ForwardModel`."""
         return self.config.branches
@@ -289,8 +293,8 @@ class ArmGoalEnv(Task):
         goals = jax.vmap(self.sample_goal)(jax.random.split(goal_key, n))
         state = jax.vmap(self.start)(self.arm.sample(pose_key, (n,)), goals)
         kinds = {
-            "one_shot": solve(self, act, goals, 0).errors,
-            "refined": solve(self, act, goals, self.config.refinements).errors,
+            "one_shot": solve(self, act, goals, 0).answer.errors,
+            "refined": solve(self, act, goals, self.config.refinements).answer.errors,
             "episode": self._episode(act, state, goals),
             "initial": state.metrics,
         }
@@ -303,7 +307,7 @@ class ArmGoalEnv(Task):
     def watch(self, act: Act, key: jax.Array) -> dict[str, jax.Array]:
         """Mean errors of one answer to a few hundred goals, `policy_<component>`."""
         goals = jax.vmap(self.sample_goal)(jax.random.split(key, PROBES))
-        return {f"policy_{name}": values.mean() for name, values in solve(self, act, goals, 0).errors.items()}
+        return {f"policy_{name}": values.mean() for name, values in solve(self, act, goals, 0).answer.errors.items()}
 
     def _episode(self, act: Act, state: State, goals: Goal) -> dict[str, jax.Array]:
         branch = act.branch(state.obs)
@@ -362,19 +366,3 @@ class CorrectionState(NamedTuple):
     asked: Goal
     best: Goal
     reward: jax.Array
-
-
-def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
-    """What people state, rows of finite numbers (n, k) or one (k,), as rows. Raises `UserError` for anything else."""
-    shape = f"{len(components)} numbers ({', '.join(components)}), or rows of them"
-    try:
-        array = np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise UserError(f"{name} takes {shape}, not {values!r}") from None
-    if array.ndim not in (1, 2) or array.shape[-1] != len(components) or not len(array):
-        raise UserError(f"{name} takes {shape}, not an array of shape {array.shape}")
-    rows = np.atleast_2d(array)
-    for i, row in enumerate(rows, 1):
-        if not np.isfinite(row).all():
-            raise UserError(f"{name} {i} is not finite: {' '.join(map(str, row.tolist()))}")
-    return rows

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_chec
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from arm5dof.envs.metrics import Error, Metric, Score
+from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
     import mujoco
-    import numpy as np
 
 Observation = dict[str, jax.Array]
 """`state` is what the actor sees, `privileged_state` what the critic sees besides the action; both are vectors."""
@@ -217,6 +218,11 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
+    def continuous(self) -> tuple[bool, ...]:
+        """Which of them are angles modulo a turn, since the joint has no limits."""
+        ...
+
+    @property
     def branches(self) -> int:
         """How many of a policy's candidate answers are followed where answers are corrected."""
         ...
@@ -276,3 +282,19 @@ def episode_returns(env: Task, act: Act, key: jax.Array, n: int) -> jax.Array:
 
     (_, total, _), _ = jax.lax.scan(step, (state, jnp.zeros(n), jnp.ones(n)), None, env.episode_length)
     return total
+
+
+def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
+    """What people state, rows of finite numbers (n, k) or one (k,), as rows. Raises `UserError` for anything else."""
+    shape = f"{len(components)} numbers ({', '.join(components)}), or rows of them"
+    try:
+        array = np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} takes {shape}, not {values!r}") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != len(components) or not len(array):
+        raise UserError(f"{name} takes {shape}, not an array of shape {array.shape}")
+    rows = np.atleast_2d(array)
+    for i, row in enumerate(rows, 1):
+        if not np.isfinite(row).all():
+            raise UserError(f"{name} {i} is not finite: {' '.join(map(str, row.tolist()))}")
+    return rows

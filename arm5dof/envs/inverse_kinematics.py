@@ -15,6 +15,10 @@ DAMPING = 1e-4
 """Of the first step, square metres: less than the square of what a joint's whole range moves."""
 LIMIT = 1e-4
 """Actions nearer to a limit count as at it: an actor's tanh only comes near."""
+STEPS = 6
+"""Of least squares from one goal of a line to the next, which is near."""
+LAST_STEPS, LAST_STARTS, AT_ONCE = 30, 8, 128
+"""Of least squares to goals that all else missed; from how many random actions besides; how many goals at once."""
 
 
 class Answer(NamedTuple):
@@ -28,20 +32,28 @@ class Answer(NamedTuple):
     """How far that is from the goal, by component: (n,) each, metres or radians."""
 
 
-def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Answer:
+class Candidate(NamedTuple):
+    """Actions (n, action_size), the answers that they are, and their rewards (n,)."""
+
+    action: jax.Array
+    answer: Answer
+    reward: jax.Array
+
+
+def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candidate:
     """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose: its preferred answer, or
     with `corrections` > 0 of all `candidates` the one of the highest reward."""
     if corrections:
-        answers, rewards = candidates(env, act, goals, corrections)
-        best = rewards.argmax(0)
-        return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], answers)
-    return _judge(env, goals, act(jax.vmap(env.question)(goals)))[0]
+        found = candidates(env, act, goals, corrections, env.branches)
+        best = found.reward.argmax(0)
+        return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], found)
+    return _judge(env, goals, act(jax.vmap(env.question)(goals)))
 
 
-def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> tuple[Answer, jax.Array]:
-    """Several answers to each goal, (candidates, n), the policy's preferred one first, and their rewards.
+def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int, branches: int | None = None) -> Candidate:
+    """Several answers to each goal, (candidates, n), the policy's preferred one first.
 
-    Those that are followed (`env.branches`) are corrected so often, each on its own branch. How is for the task to say
+    So many branches as are given, or all, are corrected so often, each for itself. How is for the task to say
     (`env.correction`): "target" asks the policy again, for goals shifted by the error that it was seen to make, with
     no Jacobian; "jacobian" takes steps of damped least squares within the joint limits, also from a few random poses
     (`env.restarts`).
@@ -49,33 +61,76 @@ def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> tu
     observe = jax.vmap(env.question)
     judge = partial(_judge, env, goals)
 
-    def follow(branch: jax.Array) -> tuple[Answer, jax.Array]:
-        asked = goals
-        best = answer, reward = judge(act(observe(goals), branch))
-        for _ in range(corrections):
-            asked = jax.vmap(env.correct)(asked, answer.outcome, goals)
-            answer, reward = judge(act(observe(asked), branch))
-            best = choose(reward > best[1], (answer, reward), best)
-        return best
+    def follow(branch: jax.Array) -> Candidate:
+        def again(_: int, state: tuple[Goal, Candidate, Candidate]) -> tuple[Goal, Candidate, Candidate]:
+            asked, now, best = state
+            asked = jax.vmap(env.correct)(asked, now.answer.outcome, goals)
+            now = judge(act(observe(asked), branch))
+            return asked, now, choose(now.reward > best.reward, now, best)
 
-    def descend(action: jax.Array) -> tuple[Answer, jax.Array]:
+        first = judge(act(observe(goals), branch))
+        return jax.lax.fori_loop(0, corrections, again, (goals, first, first))[2]
+
+    def descend(action: jax.Array) -> Candidate:
         return judge(jax.vmap(partial(_descend, env, corrections))(action, goals))
 
     obs = observe(goals)
     if env.correction == "target":
-        if env.branches == 1:
+        if branches == 1:
             return jax.tree.map(lambda x: x[None], follow(act.branch(obs)))
-        return jax.lax.map(follow, act.branches(obs)[:, : env.branches].T)
-    first = jax.lax.map(partial(act, obs), act.branches(obs)[:, : env.branches].T)
+        return jax.lax.map(follow, act.branches(obs)[:, :branches].T)
+    first = jax.lax.map(partial(act, obs), act.branches(obs)[:, :branches].T)
     random = jax.random.uniform(jax.random.key(0), (env.restarts, *first.shape[1:]), minval=-1, maxval=1)
     return jax.lax.map(descend, jnp.concatenate([first, random]))
 
 
-def _judge(env: ForwardModel, goals: Goal, action: jax.Array) -> tuple[Answer, jax.Array]:
-    """Actions (n, action_size) as answers to goals, and their rewards (n,)."""
+def nearest(env: ForwardModel, act: Act, goals: Goal, found: Candidate) -> Candidate:
+    """Answers to goals as found, (n,), but where they miss (`Error.close`): there the nearest that the robot can do, by
+    damped least squares from all of the policy's answers and from a few random ones. What is not missed costs nothing.
+    """
+    components = env.components.items()
+    missed = jnp.any(jnp.stack([found.answer.errors[name] > error.close for name, error in components]), 0)
+    n = len(missed)
+    order = jnp.append(jnp.argsort(~missed, stable=True), jnp.full(AT_ONCE, n))  # Out of range: neither read nor kept.
+    random = jax.random.uniform(jax.random.key(0), (LAST_STARTS, 1, found.action.shape[-1]), minval=-1, maxval=1)
+
+    def some(state: tuple[jax.Array, Candidate]) -> tuple[jax.Array, Candidate]:
+        i, found = state
+        rows = jax.lax.dynamic_slice(order, (i,), (AT_ONCE,))
+        asked = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), goals)
+        obs = jax.vmap(env.question)(asked)
+        starts = jax.lax.map(partial(act, obs), act.branches(obs).T)
+        starts = jnp.concatenate([starts, jnp.broadcast_to(random, (LAST_STARTS, *starts.shape[1:]))])
+        descend = partial(_descend, env, LAST_STEPS)
+        tried = jax.lax.map(lambda start: _judge(env, asked, jax.vmap(descend)(start, asked)), starts)
+        best = tried.reward.argmax(0)
+        here = jax.tree.map(lambda x: x[best, jnp.arange(AT_ONCE)], tried)
+        before = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), found)
+        better = missed.at[rows].get(mode="clip") & (here.reward > before.reward)
+        here = choose(better, here, before)
+        return i + AT_ONCE, jax.tree.map(lambda x, y: x.at[rows].set(y, mode="drop"), found, here)
+
+    return jax.lax.while_loop(lambda state: state[0] < missed.sum(), some, (jnp.array(0), found))[1]
+
+
+def follow_line(env: ForwardModel, goals: Goal, first: jax.Array) -> Candidate:
+    """Answers to goals that lie near each other (leading axis n) by damped least squares, each begun where the one
+    before ended, (candidates, n); from several actions (candidates, action_size)."""
+
+    def step(actions: jax.Array, goal: Goal) -> tuple[jax.Array, jax.Array]:
+        moved = jax.vmap(partial(_descend, env, STEPS), (0, None))(actions, goal)
+        return moved, moved
+
+    actions = jax.lax.scan(step, first, goals)[1].swapaxes(0, 1)
+    return jax.lax.map(partial(_judge, env, goals), actions)
+
+
+def _judge(env: ForwardModel, goals: Goal, action: jax.Array) -> Candidate:
+    """Actions (n, action_size) as answers to goals."""
     outcome = jax.vmap(env.outcome)(action)
     reward, _ = jax.vmap(env.goal_reward)(outcome, goals, action)
-    return Answer(jax.vmap(env.joints)(action), outcome, jax.vmap(env.errors)(outcome, goals)), reward
+    answer = Answer(jax.vmap(env.joints)(action), outcome, jax.vmap(env.errors)(outcome, goals))
+    return Candidate(action, answer, reward)
 
 
 def _descend(env: ForwardModel, steps: int, action: jax.Array, goal: Goal) -> jax.Array:

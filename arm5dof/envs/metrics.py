@@ -57,6 +57,11 @@ class Error:
         """What counts as reached, unless people say otherwise, in the unit."""
         return self.within[-1]
 
+    @property
+    def close(self) -> float:
+        """What counts as met where one answer is preferred to another for something else than its error, SI."""
+        return self.within[0] / self.scale
+
     def summary(self, values: np.ndarray) -> Summary:
         found = values * self.scale
         return {

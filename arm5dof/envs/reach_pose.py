@@ -10,8 +10,8 @@ import numpy as np
 from annotated_types import Gt
 
 from arm5dof.arm import se3
-from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv, vectors
-from arm5dof.envs.base import Act
+from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv
+from arm5dof.envs.base import Act, vectors
 from arm5dof.envs.metrics import Error, Metric, Share
 from arm5dof.envs.physics import Physics
 from arm5dof.errors import UserError

@@ -11,9 +11,10 @@ import numpy as np
 from flax import struct
 
 from arm5dof.ddpg import DDPG, DDPGConfig, Networks
-from arm5dof.envs import ForwardModel, Task, inverse_kinematics
-from arm5dof.envs.base import Goal, Observation
-from arm5dof.envs.inverse_kinematics import Answer
+from arm5dof.envs import ForwardModel, Task, inverse_kinematics, paths
+from arm5dof.envs.base import Goal, Observation, vectors
+from arm5dof.envs.inverse_kinematics import Answer, Candidate
+from arm5dof.envs.paths import Path
 from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
 
@@ -76,14 +77,19 @@ class Policy(struct.PyTreeNode, eq=False):
             raise UserError(f"the task {type(self.env).__name__} has no forward model: its policy only acts")
         return self.env
 
-    def solve(self, *target: Any, corrections: int = 0, candidates: bool = False, **inputs: Any) -> Answer:
+    def solve(
+        self, *target: Any, corrections: int = 0, near: Any = None, candidates: bool = False, **inputs: Any
+    ) -> Answer:
         """Inverse kinematics: ask for joint positions that lead to goals, from the arm's home pose.
 
         Args:
             target: The first of the task's goal inputs, which for the tasks that ship is a point (3,), metres in the
                 world frame, or several, (n, 3).
             corrections: How often the policy is asked again for a goal shifted by the error it was seen to make
-                (closed-loop target correction). The best answer counts.
+                (closed-loop target correction). The best answer counts; where it misses, as it must out of reach, the
+                nearest that damped least squares finds, begun at all of the policy's answers and a few random ones.
+            near: Joint positions (dof,), or (n, dof), radians (metres for slides): of all the actor's answers that are
+                within the smallest limits of the task's errors (1 mm, 0.5 degrees) the nearest to these counts.
             candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the
                 policy's preferred one first: with an axis (candidates,) after that of the goals. Some may be far off.
             inputs: The goal inputs by name: `target=...`, and for `reach_pose` `approach=...` (3,) or (n, 3), or
@@ -95,6 +101,87 @@ class Policy(struct.PyTreeNode, eq=False):
         Raises:
             UserError: A goal is missing, not finite or of another shape, or the task has no forward model.
         """
+        goals, single = self._goals(target, inputs, corrections)
+        turns = self.forward_model.continuous
+        if near is not None:
+            if candidates:
+                raise UserError("solve takes near or candidates, not both")
+            found, met = self._candidates(goals, corrections)
+            pose = self._pose("near", near, len(met[0]))
+            which = paths.nearest(np.asarray(found.answer.q), met, np.asarray(found.reward), turns, pose)
+            answer = _pick(found, which)
+            answer = answer._replace(q=jnp.asarray(paths.beside(np.asarray(answer.q), pose, turns)))
+        elif candidates:
+            found = _ask(self.forward_model, self, goals, corrections, self.forward_model.branches)
+            answer = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), found.answer)
+        else:
+            answer = _solve(self.forward_model, self, goals, corrections)
+        return jax.tree.map(lambda x: x[0], answer) if single else answer
+
+    def solve_all(self, *target: Any, corrections: int = 10, **inputs: Any) -> Answer:
+        """Every distinct answer of the actor to one goal, the best first.
+
+        Args:
+            target: As for `solve`, but one goal.
+            corrections: As for `solve`, of each answer.
+            inputs: As for `solve`.
+
+        Returns:
+            An `Answer` with a leading axis (k,). Some may be far off: see their errors.
+
+        Raises:
+            UserError: As for `solve`, or there are several goals.
+        """
+        goals, single = self._goals(target, inputs, corrections)
+        if not single:
+            raise UserError("solve_all takes one goal")
+        found = jax.tree.map(lambda x: x[:, 0], self._candidates(goals, corrections)[0])
+        rows = np.array(
+            paths.distinct(np.asarray(found.answer.q), np.asarray(found.reward), self.forward_model.continuous)
+        )
+        return jax.tree.map(lambda x: x[rows], found.answer)
+
+    def path(self, *target: Any, start: Any = None, corrections: int = 10, **inputs: Any) -> Path:
+        """Answers to a line of goals that lie near each other, without a jump of a joint where there is such a way.
+
+        One branch of the actor is kept where one serves. Where none does, lines of damped least squares that begin at
+        the answers to the first and to the last goal are candidates too.
+
+        Args:
+            target: As for `solve`, (n, 3).
+            start: Joint positions (dof,), radians (metres for slides), from which the joints' way is to be short.
+            corrections: As for `solve`.
+            inputs: As for `solve`.
+
+        Returns:
+            A `Path`. A goal may be missed, and a joint may jump: see its `errors` and `jumps`.
+
+        Raises:
+            UserError: As for `solve`, or there is one goal only.
+        """
+        goals, single = self._goals(target, inputs, corrections)
+        found, met = self._candidates(goals, corrections)
+        n = met.shape[1]
+        if single or n < 2:
+            raise UserError("path takes the goals of a line, two or more: for one use solve")
+        begin = None if start is None else self._pose("start", start, 1)[0]
+        best = self._path(found, begin)
+        if best.jumps.any() or not self._met(best).all():
+            more = _lines(self.forward_model, goals, found.action[:, [0, -1]])
+            best = self._path(jax.tree.map(lambda *parts: jnp.concatenate(parts), found, more), begin)
+        return best
+
+    def _path(self, found: Candidate, begin: np.ndarray | None) -> Path:
+        """The best line of candidates (k, n)."""
+        turns = self.forward_model.continuous
+        answer = _pick(found, paths.chain(np.asarray(found.answer.q), self._met(found.answer), turns, begin))
+        q = paths.unwound(np.asarray(answer.q), turns)
+        if begin is not None:
+            q = q + paths.beside(q[0], begin, turns) - q[0]
+        return Path(jnp.asarray(q), answer.outcome, answer.errors, paths.jumps(q))
+
+    def _goals(self, target: tuple[Any, ...], inputs: dict[str, Any], corrections: Any) -> tuple[Goal, bool]:
+        """Goals with a leading axis, and whether one was stated without."""
         model = self.forward_model
         names = list(model.goal_inputs)
         given = {**dict(zip(names, target, strict=False)), **inputs}
@@ -109,9 +196,24 @@ class Policy(struct.PyTreeNode, eq=False):
         goals = model.goals(**given)
         if len({len(leaf) for leaf in jax.tree.leaves(goals)}) > 1:
             raise UserError(f"solve takes as many of each of {' and '.join(names)}")
-        single = all(np.ndim(values) == 1 for values in given.values())
-        answer = _solve(model, self, goals, corrections, candidates)
-        return jax.tree.map(lambda x: x[0], answer) if single else answer
+        return goals, all(np.ndim(values) == 1 for values in given.values())
+
+    def _pose(self, name: str, values: Any, rows: int) -> np.ndarray:
+        """Joint positions that people give, (1, dof) or (rows, dof). Raises `UserError` for anything else."""
+        poses = np.atleast_2d(vectors(name, values, self.forward_model.joint_names))
+        if len(poses) not in (1, rows):
+            wanted = "one pose" if rows == 1 else f"one pose, or one for each of {rows} goals"
+            raise UserError(f"{name} takes {wanted}, not {len(poses)}")
+        return poses
+
+    def _candidates(self, goals: Goal, corrections: int) -> tuple[Candidate, np.ndarray]:
+        """The answers of all the actor's heads, (k, n), and which meet their goals."""
+        found = _ask(self.forward_model, self, goals, corrections, None)
+        return found, self._met(found.answer)
+
+    def _met(self, answer: Answer | Path) -> np.ndarray:
+        components = self.forward_model.components
+        return np.all([np.asarray(answer.errors[name]) <= error.close for name, error in components.items()], axis=0)
 
     def _table(self) -> Table:
         weights = lambda network: f"{sum(leaf.size for leaf in jax.tree.leaves(network)):,} weights"
@@ -132,13 +234,31 @@ class Policy(struct.PyTreeNode, eq=False):
         return self._table().html()
 
 
-@partial(jax.jit, static_argnames=("env", "corrections", "every"))
-def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int, every: bool) -> Answer:
+@partial(jax.jit, static_argnames=("env", "corrections"))
+def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
-    if every:
-        answers, _ = inverse_kinematics.candidates(env, policy, goals, corrections)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), answers)
-    return inverse_kinematics.solve(env, policy, goals, corrections)
+    found = inverse_kinematics.solve(env, policy, goals, corrections)
+    return (inverse_kinematics.nearest(env, policy, goals, found) if corrections else found).answer
+
+
+@partial(jax.jit, static_argnames=("env", "corrections", "branches"))
+def _ask(env: ForwardModel, policy: Policy, goals: Goal, corrections: int, branches: int | None) -> Candidate:
+    return inverse_kinematics.candidates(env, policy, goals, corrections, branches)
+
+
+@partial(jax.jit, static_argnames="env")
+def _lines(env: ForwardModel, goals: Goal, ends: jax.Array) -> Candidate:
+    """Along the goals from actions (k, 2, action_size) at the first and back from those at the last, (2 k, n)."""
+    turned = lambda tree: jax.tree.map(lambda x: x[::-1], tree)
+    there = inverse_kinematics.follow_line(env, goals, ends[:, 0])
+    back = inverse_kinematics.follow_line(env, turned(goals), ends[:, 1])
+    back = jax.tree.map(lambda x: x[:, ::-1], back)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), there, back)
+
+
+def _pick(found: Candidate, which: np.ndarray) -> Answer:
+    """Of candidates (k, n) one for each goal."""
+    return jax.tree.map(lambda x: x[which, np.arange(len(which))], found.answer)
 
 
 def _is_single(env: Task, obs: Any) -> bool:

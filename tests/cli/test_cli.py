@@ -124,6 +124,36 @@ def test_solve_answers_and_tells_its_error(trained, capsys):
         assert miss == pytest.approx(answer["error_mm"], abs=1e-3)
 
 
+def test_solve_gives_every_answer_and_the_nearest(trained, capsys):
+    target = ("solve", trained, "--target", 0.15, 0.05, 0.12, "--tolerance-mm", 1000, "--json")
+    capsys.readouterr()
+    assert run(*target, "--all") == 0
+    every = [list(row["joints_rad"].values()) for row in json.loads(capsys.readouterr().out)]
+    assert len(every) > 1
+    assert run(*target) == 0
+    (best,) = json.loads(capsys.readouterr().out)
+    # None is within a millimetre, so that the best counts wherever the joints are.
+    assert run(*target, "--near", *every[0]) == 0
+    (near,) = json.loads(capsys.readouterr().out)
+    assert near["error_mm"] <= best["error_mm"] + 1e-3
+
+
+def test_solve_follows_a_path_or_says_where_a_joint_jumps(trained, tmp_path, fails):
+    line = np.array([0.15, 0.05, 0.12]) + np.linspace(0, 1, 20)[:, None] * [0.02, -0.02, 0.02]
+    (tmp_path / "line.csv").write_text("x,y,z\n" + "\n".join(",".join(map(str, point)) for point in line))
+    out = tmp_path / "answers.csv"
+    assert run("solve", trained, "--csv", tmp_path / "line.csv", "--out", out, "--path", "--tolerance-mm", 1) == 0
+    rows = list(csv.DictReader(open(out)))
+    q = np.array([[float(row[f"theta_{i}"]) for i in range(1, 6)] for row in rows])
+    assert q.shape == (20, 5) and np.abs(np.diff(q, axis=0)).max() < 0.5
+    apart = ("--target", 0.2, 0.1, 0.1, "--target", -0.2, -0.1, 0.2, "--tolerance-mm", 1000)
+    assert "1 jumps of a joint on the path, the first to (-0.2, -0.1, 0.2) m" in fails(
+        "solve", trained, *apart, "--path"
+    )
+    assert "leave out --all" in fails("solve", trained, *apart, "--path", "--all")
+    assert "leave out --near" in fails("solve", trained, *apart, "--all", "--near", *[0] * 5)
+
+
 def test_solve_takes_and_gives_csv(trained, tmp_path):
     points, answers = tmp_path / "points.csv", tmp_path / "answers.csv"
     points.write_text("name,x,y,z\na,0.15,0.05,0.12\nb,0.1,-0.1,0.2\n")

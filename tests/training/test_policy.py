@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from helpers.errors import said
@@ -14,9 +15,11 @@ from arm5dof.envs import State, Task
 from arm5dof.envs.inverse_kinematics import solve
 from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
+from arm5dof.grasp.shipped import shipped
 from arm5dof.settings import settings, static
 from arm5dof.training.config import load_config
 from arm5dof.training.policy import Policy
+from arm5dof.training.policy_file import load_policy
 
 SMALL = load_config("kinematic.toml", actor_width=16, actor_depth=1, critic_width=8, critic_depth=1, heads=3).ddpg
 PLAIN = DDPGConfig(actor_width=16, actor_depth=1, critic_width=8, critic_depth=1)
@@ -169,8 +172,8 @@ def test_corrections_follow_several_branches(arm: Arm, followed: int):
         def branch(self, obs):
             return order[:, self.rank]
 
-    errors = np.stack([solve(single, Alone(rank), goals, 3).errors["distance"] for rank in range(followed)])
-    found = policy.solve(np.asarray(goals), corrections=3)
+    errors = np.stack([solve(single, Alone(rank), goals, 3).answer.errors["distance"] for rank in range(followed)])
+    found = solve(env, policy, goals, 3).answer
     np.testing.assert_allclose(found.errors["distance"], errors.min(0), atol=1e-6)
     assert (errors.argmin(0) > 0).any()
     every = policy.solve(np.asarray(goals), corrections=3, candidates=True)
@@ -178,7 +181,9 @@ def test_corrections_follow_several_branches(arm: Arm, followed: int):
     np.testing.assert_allclose(every.errors["distance"], errors.T, atol=1e-6)
     np.testing.assert_allclose(env.arm.forward(found.q), found.outcome, atol=1e-6)
     first = policy.solve(np.asarray(goals))
-    np.testing.assert_allclose(first.errors["distance"], solve(single, policy, goals, 0).errors["distance"], atol=1e-6)
+    np.testing.assert_allclose(
+        first.errors["distance"], solve(single, policy, goals, 0).answer.errors["distance"], atol=1e-6
+    )
 
 
 def test_a_policy_says_what_it_acts_on(policy: Policy):
@@ -205,3 +210,64 @@ def test_a_policy_shows_itself_as_a_table(policy: Policy):
     text, html = repr(policy), policy._repr_html_()
     for word in ("Policy", "Reach", "3 heads", "target (x, y, z)"):
         assert word in text and word in html
+
+
+@pytest.fixture(scope="module")
+def trained() -> Policy:
+    return load_policy(shipped("arm5.xml").policy)
+
+
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def test_every_answer_is_the_nearest_to_itself(trained: Policy):
+    point = [0.16, 0.06, 0.03]
+    every = trained.solve_all(point, DOWN)
+    met = np.asarray(every.errors["distance"]) < 1e-3
+    poses = np.asarray(every.q)[met & (np.asarray(every.errors["angle"]) < np.deg2rad(0.5))]
+    assert len(poses) > 1 and np.abs(poses[0] - poses[1]).max() >= 0.05
+    for pose in poses:
+        np.testing.assert_allclose(trained.solve(point, DOWN, corrections=10, near=pose).q, pose, atol=0.05)
+
+
+@pytest.mark.parametrize("which", ["policy", "trained"])
+def test_joints_follow_a_line_without_a_jump(which: str, request: pytest.FixtureRequest):
+    """Also where the policy has learnt nothing, so that none of its own answers serves."""
+    policy: Policy = request.getfixturevalue(which)
+    line = np.array([0.13, -0.1, 0.08]) + np.linspace(0, 1, 40)[:, None] * [0.03, 0.06, -0.04]
+    more = {"approach": np.tile(DOWN, (40, 1))} if which == "trained" else {}
+    path = policy.path(line, **more)
+    assert np.asarray(path.errors["distance"]).max() < 1e-3 and not path.jumps.any()
+    assert np.abs(np.diff(path.q, axis=0)).max() < 0.5
+    data, arm = mujoco.MjData(policy.env.arm.mj_model), policy.env.arm
+    for q, point in zip(np.asarray(path.q), line, strict=True):
+        assert (q >= arm.lower - 1e-6).all() and (q <= arm.upper + 1e-6).all()
+        data.qpos[arm.qpos] = q
+        mujoco.mj_kinematics(arm.mj_model, data)
+        np.testing.assert_allclose(data.site_xpos[arm.site], point, atol=1.1e-3)
+    other = np.asarray(policy.path(line[::-1], start=path.q[-1], **more).q)
+    np.testing.assert_allclose(other[0], path.q[-1], atol=0.05)
+
+
+def test_a_path_says_where_a_joint_jumps(policy: Policy):
+    """There is no way from one side of the arm to the other in one step."""
+    path = policy.path([[0.2, 0.1, 0.1], [0.2, 0.099, 0.1], [-0.2, -0.1, 0.2]])
+    np.testing.assert_array_equal(path.jumps, [False, False, True])
+
+
+def test_near_and_path_say_what_they_take(policy: Policy):
+    point = [0.15, 0.05, 0.12]
+    joints = "theta_1, theta_2, theta_3, theta_4, theta_5"
+    assert said(lambda: policy.solve(point, near=[0, 0])) == (
+        f"near takes 5 numbers ({joints}), or rows of them, not an array of shape (2,)"
+    )
+    assert said(lambda: policy.solve([point] * 3, near=np.zeros((2, 5)))) == (
+        "near takes one pose, or one for each of 3 goals, not 2"
+    )
+    assert said(lambda: policy.solve(point, near=np.zeros(5), candidates=True)) == (
+        "solve takes near or candidates, not both"
+    )
+    assert said(lambda: policy.path(point)).startswith("path takes the goals of a line")
+    assert said(lambda: policy.path([point])).startswith("path takes the goals of a line")
+    assert said(lambda: policy.path([point] * 2, start=np.zeros((2, 5)))) == ("start takes one pose, not 2")
+    assert said(lambda: policy.solve_all([point])) == "solve_all takes one goal"

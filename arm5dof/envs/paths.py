@@ -1,0 +1,98 @@
+"""Of several answers to each goal, those that go together: near where the arm is, and without a jump along a line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from arm5dof.envs.base import Goal
+
+JUMP = 0.5
+"""A joint that moves further from one goal of a line to the next has jumped, radians (metres for slides)."""
+MISSED, JUMPED = 1e9, 1e5
+"""What a goal missed and a jump count beside the joints' travel, radians: more than any line travels."""
+SAME = 0.05
+"""Answers are the same whose joints differ by less, radians (metres for slides)."""
+
+
+class Path(NamedTuple):
+    """Answers to a line of n goals."""
+
+    q: jax.Array
+    """Joint positions, (n, dof), radians (metres for slides)."""
+    outcome: Goal
+    """Where they lead by forward kinematics, a goal with leading axis n."""
+    errors: dict[str, jax.Array]
+    """How far that is from the goals, by component: (n,) each, metres or radians."""
+    jumps: np.ndarray
+    """Whether a joint has moved by more than `JUMP` since the goal before, (n,) bool."""
+
+
+def moved(a: np.ndarray, b: np.ndarray, continuous: Sequence[bool]) -> np.ndarray:
+    """From one pose to another by the shorter way, (..., dof): of joints that are continuous modulo a turn."""
+    way = b - a
+    return np.where(continuous, (way + np.pi) % (2 * np.pi) - np.pi, way)
+
+
+def chain(q: np.ndarray, met: np.ndarray, continuous: Sequence[bool], start: np.ndarray | None = None) -> np.ndarray:
+    """Choose one of several poses at each goal of a line: the fewest goals missed, then the fewest jumps, then the
+    shortest way of the joints (Viterbi's algorithm).
+
+    Args:
+        q: Joint positions, (k, n, dof), radians.
+        met: Which of them meet their goal, (k, n) bool.
+        continuous: Which joints are angles modulo a turn, (dof,).
+        start: Where the arm is, (dof,), from where the way is counted too; None for anywhere.
+
+    Returns:
+        Which pose, (n,) int.
+    """
+    missed = np.where(met, 0.0, MISSED)
+    cost = missed[:, 0] + (0.0 if start is None else np.abs(moved(start, q[:, 0], continuous)).sum(-1))
+    back = []
+    for before, here, miss in zip(q[:, :-1].swapaxes(0, 1), q[:, 1:].swapaxes(0, 1), missed[:, 1:].T, strict=True):
+        way = np.abs(moved(before[:, None], here, continuous))
+        through = cost[:, None] + way.sum(-1) + JUMPED * (way.max(-1) > JUMP)
+        back.append(through.argmin(0))
+        cost = through.min(0) + miss
+    chosen = [int(cost.argmin())]
+    for links in reversed(back):
+        chosen.append(int(links[chosen[-1]]))
+    return np.array(chosen[::-1])
+
+
+def jumps(q: np.ndarray) -> np.ndarray:
+    """Where joints jump, (n,) bool, along poses (n, dof)."""
+    return np.append(False, np.abs(np.diff(q, axis=0)).max(-1) > JUMP)
+
+
+def beside(q: np.ndarray, near: np.ndarray, continuous: Sequence[bool]) -> np.ndarray:
+    """The same poses, (..., dof), whose continuous joints make no turn more than they need from others."""
+    return np.where(continuous, near + moved(near, q, continuous), q)
+
+
+def unwound(q: np.ndarray, continuous: Sequence[bool]) -> np.ndarray:
+    """Poses along a line, (n, dof), whose continuous joints count the turns that they make from the first on."""
+    way = np.cumsum(moved(q[:-1], q[1:], continuous), axis=0)
+    return np.concatenate([q[:1], np.where(continuous, q[0] + way, q[1:])])
+
+
+def nearest(
+    q: np.ndarray, met: np.ndarray, reward: np.ndarray, continuous: Sequence[bool], near: np.ndarray
+) -> np.ndarray:
+    """Which of several answers (k, n, dof) to each goal is nearest to a pose (dof,), or to one for each (n, dof), by
+    its furthest joint, of those that meet it (k, n) bool; the one of the highest reward (k, n) where none does. (n,)"""
+    away = np.where(met, np.abs(moved(near, q, continuous)).max(-1), np.inf)
+    return np.where(met.any(0), away.argmin(0), reward.argmax(0))
+
+
+def distinct(q: np.ndarray, reward: np.ndarray, continuous: Sequence[bool]) -> list[int]:
+    """Which of several poses (k, dof) differ, in the order of their rewards (k,), the highest first."""
+    chosen: list[int] = []
+    for i in np.argsort(-reward, kind="stable"):
+        if all(np.abs(moved(q[i], q[j], continuous)).max() >= SAME for j in chosen):
+            chosen.append(int(i))
+    return chosen
