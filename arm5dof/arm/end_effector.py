@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 import mujoco
@@ -15,6 +16,8 @@ from arm5dof.errors import UserError, nearest_hint
 DEFAULT = "ee"
 """The site that is the end effector where there is one of that name and none is asked for."""
 
+KINDS = ("body", "geom")
+"""What a place may be given on."""
 TOOLS = (
     r"\bee\b|\beef\b|\bend ?effector",
     r"\btcp\b",
@@ -54,8 +57,8 @@ def find_end_effector(spec: mujoco.MjSpec | None, model: mujoco.MjModel, wanted:
     Args:
         spec: What the model was compiled from, if it is at hand; it stays as it is.
         model: The compiled model.
-        wanted: A site's name; `body NAME` or `geom NAME`, with or without an offset `X Y Z` in its frame, metres; or
-            nothing, to choose.
+        wanted: A site's name; a body's or a geom's, with or without an offset `X Y Z` in its frame, metres, and after
+            `body ` or `geom ` where that is not plain; or nothing, to choose.
 
     Raises:
         UserError: There is no such site, body or geom, or the model is to get a site and is only at hand compiled.
@@ -67,30 +70,34 @@ def find_end_effector(spec: mujoco.MjSpec | None, model: mujoco.MjModel, wanted:
     if not wanted:
         return _choose(spec, model)
     kind, _, rest = wanted.partition(" ")
-    if kind not in ("body", "geom") or not rest:
-        there = ", ".join(filter(None, sites)) or "none"
-        raise UserError(
-            f"the model has no site {wanted!r} to use as end effector; it has: {there}; any place is 'body NAME X Y Z'"
-        )
-    return _with_site(spec, model, wanted, _place(model, kind, rest), "")
+    kinds, text = ((kind,), rest) if kind in KINDS and rest else (KINDS, wanted)
+    place = next((found for k in kinds if (found := _place(model, k, text)) is not None), None)
+    if place is None:
+        what = "site, body or geom" if kinds == KINDS else kind
+        names = [*(sites if kinds == KINDS else ()), *(name for k in kinds for name in _names(model, k))]
+        hint = nearest_hint(text, [*filter(None, names)])
+        raise UserError(f"the model has no {what} {text!r} to use as end effector: {hint}")
+    return _with_site(spec, model, wanted, place, "")
 
 
-def _place(model: mujoco.MjModel, kind: str, text: str) -> _Place:
-    """Where `NAME` or `NAME X Y Z` is, on a body or a geom."""
-    words, offset = text.split(" "), np.zeros(3)
-    try:
-        offset = np.array([float(word) for word in words[-3:]]) if len(words) > 3 else offset
-        name = " ".join(words[:-3] if len(words) > 3 else words)
-    except ValueError:
-        name = text
-    bodies = kind == "body"
-    names = [(model.body(i) if bodies else model.geom(i)).name for i in range(model.nbody if bodies else model.ngeom)]
+def _names(model: mujoco.MjModel, kind: str) -> list[str]:
+    if kind == "body":
+        return [model.body(i).name for i in range(model.nbody)]
+    return [model.geom(i).name for i in range(model.ngeom)]
+
+
+def _place(model: mujoco.MjModel, kind: str, text: str) -> _Place | None:
+    """Where `NAME` or `NAME X Y Z` is, on a body or a geom; None if there is none of that name."""
+    name, offset = text, np.zeros(3)
+    if found := re.fullmatch(r"(.+?)((?: \S+){3})", text):
+        with suppress(ValueError):
+            offset = np.array([float(word) for word in found[2].split()])
+            name = found[1]
+    names = _names(model, kind)
     if name not in names or not np.isfinite(offset).all():
-        raise UserError(
-            f"the model has no {kind} {name!r} for an end effector: {nearest_hint(name, [*filter(None, names)])}"
-        )
+        return None
     i = names.index(name)
-    if bodies:
+    if kind == "body":
         return _Place(i, offset, np.array([1.0, 0, 0, 0]))
     position = model.geom_pos[i] + matrix(model.geom_quat[i]) @ offset
     return _Place(int(model.geom_bodyid[i]), position, model.geom_quat[i].copy())

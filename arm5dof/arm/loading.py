@@ -31,9 +31,9 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = ""
 
     Args:
         source: An MJCF or URDF file (the user's, or one that ships in `mjcf/`), an `MjSpec`, or a compiled `MjModel`.
-        site: The end effector: a site's name; `body NAME` or `geom NAME`, with or without an offset `X Y Z` in its
-            frame, metres; or nothing: the site `ee`, else what is named most like a tool, else the last link. The
-            model gets a site for what is none, unless it comes compiled.
+        site: The end effector: a site's name; a body's or a geom's, with or without an offset `X Y Z` in its frame,
+            metres (`hand 0 0 0.1`, `body hand`); or nothing: the site `ee`, else what is named most like a tool, else
+            the last link. The model gets a site for what is none, unless it comes compiled.
         base: A body that is held still, with all that carries it, where the MJCF has it: of an arm on a mobile or
             free base. Nothing: the arm begins at the world.
 
@@ -49,10 +49,9 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = ""
     7
     >>> round(load_arm("arm7.xml", site="body wrist 0 0 0.1").measured_reach, 6)
     0.59
-    >>> load_arm("arm7.xml", site="flange")
+    >>> load_arm("arm7.xml", site="eef")
     Traceback (most recent call last):
-    arm5dof.errors.UserError: the model has no site 'flange' to use as end effector; it has: ee; any place is 'body \
-NAME X Y Z'
+    arm5dof.errors.UserError: the model has no site, body or geom 'eef' to use as end effector: did you mean 'ee'?
     """
     spec, model = _compile(source)
     spec, model, held = hold_base(spec, model, base) if base else (spec, model, ())

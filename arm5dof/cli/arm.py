@@ -18,13 +18,13 @@ Tell how a robot's MJCF or URDF is read as an arm: the first thing to run on a n
 
   arm5dof arm my_robot.xml                              joints, end effector, reach, and what may be trained
   arm5dof arm my_robot.xml --site tool0                 another end effector: a site,
-  arm5dof arm my_robot.xml --site "body hand 0 0 0.1"   or a place on a body or geom, metres in its frame
+  arm5dof arm my_robot.xml --tool "hand 0 0 0.1"        or a place on a body or geom, metres in its frame
   arm5dof arm rover.xml --base chassis                  an arm on a mobile or free base, which is held still
   arm5dof arm my_robot.xml --figure arm.png             a picture, with the end effector's axes: x red, y green, z blue
 
 Joints are those on the way from the world or the base to the end effector; whatever else moves is left alone. A hinge
 without limits is trained over one turn. What cannot be an arm is refused with all that is wrong with it.
-The same --site and --base go to arm5dof train --arm my_robot.xml.
+The same --site, --tool and --base go to arm5dof train --arm my_robot.xml.
 """
 
 
@@ -32,7 +32,9 @@ def declare(commands: argparse._SubParsersAction) -> None:
     """Add `arm` to the commands."""
     p = commands.add_parser("arm", help="tell how a robot is read, before it is trained", description=HELP)
     p.add_argument("file", metavar="FILE", help="an MJCF or URDF file, or the name of an MJCF that ships")
-    p.add_argument("--site", default="", help="the end effector; default: the site ee, else what is named like a tool")
+    p.add_argument(
+        "--site", "--tool", default="", help="the end effector; default: the site ee, else what is named like a tool"
+    )
     p.add_argument("--base", default="", metavar="BODY", help="hold this body still, with all that carries it")
     p.add_argument("--json", action="store_true", help="print one JSON object, in radians and metres")
     p.add_argument("--figure", type=Path, metavar="OUT.png", help="draw it, its joints in the middle of their ranges")

@@ -24,7 +24,7 @@ a folder with its configuration, its robot, metrics, checkpoints, a figure and r
   arm5dof train kinematic.toml --seed 1 --out DIR   another one, another seed, into DIR
   arm5dof train reach_pose.toml                     points and directions: which way the tool points
   arm5dof train --arm my_arm.xml                    your own arm; arm5dof arm my_arm.xml shows how it is read
-  arm5dof train --arm my_arm.xml --site "body hand 0 0 0.1"   with the end effector 0.1 m along z from a body
+  arm5dof train --arm my_arm.xml --tool "hand 0 0 0.1"   with the end effector 0.1 m along z from a body
   arm5dof train --arm rover.xml --base chassis      an arm on a base that stands still
   arm5dof train my.toml                             your own task: [env] task = "my_module:MyTask"
   arm5dof train --smoke                             a minute on a laptop, to see that everything works
@@ -59,6 +59,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
     # Help lists the settings, and importing those takes JAX, so only help pays for it.
     p.add_argument("-h", "--help", action="store_true", help="show this help, every setting included")
     p.add_argument("--out", type=Path, metavar="DIR", help="the run's folder; default: runs/<experiment>")
+    p.add_argument("--tool", metavar="NAME [X Y Z]", help="the same as --site: a place on a body or geom, metres")
     p.add_argument("--resume", type=Path, metavar="DIR", help="go on with the run in this folder")
     p.add_argument("--smoke", action="store_true", help="a short run with small batches")
     p.add_argument(
@@ -74,6 +75,10 @@ def declare(commands: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof train`."""
     experiment, texts = _experiment_and_settings(rest)
+    if args.tool is not None:
+        if "site" in texts:
+            raise UserError("--tool and --site say the same: give one")
+        texts["site"] = args.tool
     if args.help:
         _print_help(args.parser, experiment or "reach.toml")
         args.parser.exit()

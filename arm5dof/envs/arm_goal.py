@@ -34,7 +34,7 @@ class ArmGoalConfig:
     arm: str = static(default="reach.xml")
     """MJCF or URDF file with the arm: a path, or the name of one that ships with the package."""
     site: str = static(default="")
-    """The end effector: a site in that file, or a place on a body or geom: "body hand 0 0 0.1" (metres, in its frame).
+    """The end effector: a site in that file, or a place on a body or geom, "hand 0 0 0.1" (metres, in its frame).
     Empty: the site ee, else what is named most like a tool, else the last link."""
     base: str = static(default="")
     """A body of that file that is held still, with all that carries it: of an arm on a mobile or free base."""

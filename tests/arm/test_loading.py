@@ -71,10 +71,16 @@ def test_the_compiled_model_and_the_mjcf_remember_the_place():
 
 def test_no_place_that_is_not_there():
     spec = robot()
-    assert "no body 'tap' for an end effector: did you mean 'tip'?" in said(lambda: load_arm(spec, "body tap 0 0 1"))
-    assert "no geom 'tip'" in said(lambda: load_arm(spec, "geom tip"))
-    assert "no body 'tip 0 0'" in said(lambda: load_arm(spec, "body tip 0 0"))
-    assert "no body 'tip'" in said(lambda: load_arm(spec, "body tip 0 0 nan"))
+    for wanted, lacking in (
+        ("body tap 0 0 1", "body 'tap 0 0 1'"),
+        ("geom tip", "geom 'tip'"),
+        ("body tip 0 0", "body 'tip 0 0'"),
+        ("body tip 0 0 nan", "body 'tip 0 0 nan'"),
+        ("tip 0 0", "site, body or geom 'tip 0 0'"),
+    ):
+        told = said(lambda wanted=wanted: load_arm(spec, wanted))
+        assert told.startswith(f"the model has no {lacking} to use as end effector: "), wanted
+    assert "did you mean 'tip'?" in said(lambda: load_arm(spec, "tap"))
     assert "a compiled model can be given none" in said(lambda: load_arm(spec.compile(), "body tip"))
     assert "no joint moves the site 'body car'" in said(lambda: load_arm(spec, "body car"))
     assert "no joint moves the site 'body upper' away" in said(lambda: load_arm(spec, "body upper"))
