@@ -242,7 +242,7 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
         (["nowhere.toml"], "no experiment 'nowhere.toml'"),
         (["reach.toml", "again.toml"], "unexpected argument 'again.toml'"),
         (["--arm", "nowhere.xml"], "no MJCF file 'nowhere.xml'"),
-        (["--site", "nose"], "no site 'nose'"),
+        (["--site", "nose"], "no site, body or geom 'nose'"),
         (["--episodes", "30"], "no multiple of num_envs"),
         (["--epoch-steps", "7"], "does not divide"),
         (["--replay-capacity", "100000000000"], "GB are free: choose a smaller one"),

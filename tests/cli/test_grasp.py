@@ -154,7 +154,7 @@ def test_policies_of_another_arm_or_site_are_one_line(fails: Fails, tmp_path: Pa
     assert 'site = "grasp"' in fails("--policy", tmp_path / "site.zip")
     assert "is no policy, or damaged" in fails("--policy", tmp_path / "cut.zip")
     assert fails("--policy", policy, "--arm", "arm7_gripper.xml").startswith("the policy is of another arm (theta_1, ")
-    assert "no site 'grasp'" in fails("--policy", policy, "--arm", "arm7.xml")
+    assert "no site, body or geom 'grasp'" in fails("--policy", policy, "--arm", "arm7.xml")
 
 
 def test_export_writes_what_grasp_reads(capsys: pytest.CaptureFixture[str], fails: Fails, tmp_path: Path):

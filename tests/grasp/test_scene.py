@@ -185,7 +185,7 @@ def test_distractors_are_objects_too_unless_left_out():
 
 
 def test_what_cannot_be_built_is_refused():
-    with pytest.raises(UserError, match="no site 'grasp'"):
+    with pytest.raises(UserError, match="no site, body or geom 'grasp'"):
         tabletop_scene(0, arm="arm7.xml")
     with pytest.raises(UserError, match="9 bins: there is room for 8"):
         tabletop_scene(0, bins=[str(i) for i in range(9)])
