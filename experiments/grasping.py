@@ -190,8 +190,8 @@ def markdown(found: dict[str, dict]) -> str:
         "# Grasping: one object of a random class that is there, lifted by 5 cm and held for 2 s",
         "",
         f"Command: `python experiments/grasping.py`, rows of not {SCENES:,} scenes with `--scenes N --rows ROW`;",
-        f"seed {SEED}, {platform.machine()} CPU. Success is of the",
-        "requests that the arm can reach and of which the camera sees half or more; in brackets, of all it can reach.",
+        f"seed {SEED}, {platform.machine()} CPU. Success is of the requests that the arm can reach and of which the",
+        "camera sees half or more; in brackets, of all that it can reach, by the middle of an object or by its end.",
         "Told: requests that cannot be met and ended with the arm at rest, the gripper empty and a reason.",
         "",
         "| | scenes | success | another object lifted | lost by | told |",
@@ -201,7 +201,8 @@ def markdown(found: dict[str, dict]) -> str:
         if name in found:
             one = found[name]
             lost = ", ".join(f"{where} {count}" for where, count in one["failures"].items()) or "nothing"
-            share = f"{one['success_percent']:.2f} % ({one['reachable_percent']:.2f})" if one["reachable"] else ""
+            seen = f"{one['success_percent']:.2f} % " if one["in_sight"] else ""
+            share = f"{seen}({one['reachable_percent']:.2f})" if one["reachable"] else ""
             hopeless = one["scenes"] - one["reachable"]
             told = f"{one['unreachable_told']} of {hopeless}" if hopeless else ""
             wrong = f"{one['wrong_object_percent']:.2f} %"

@@ -5,12 +5,13 @@
     python experiments/sweeping.py many           1,000 members of a small program: seconds a member, memory
     python experiments/sweeping.py speed --tiny   the same with a budget of a minute, to try this script
 
-Everything is left in runs/sweeping/.
+Everything is left in runs/sweeping/, and what was found in results/sweeping_WHAT.md, but for --tiny.
 """
 
 from __future__ import annotations
 
 import argparse
+import platform
 import random
 import shutil
 import signal
@@ -22,7 +23,9 @@ from pathlib import Path
 import psutil
 
 from arm5dof import Run, Sweep
+from arm5dof.runtime import files, xla
 
+RESULTS = Path(__file__).parent / "results"
 OUT = Path("runs") / "sweeping"
 RATES, SEEDS = (1e-3, 2e-3, 5e-3, 1e-2), (0, 1, 2, 3)
 TINY = {
@@ -39,10 +42,21 @@ def main() -> None:
     arguments = parser.parse_args()
     shutil.rmtree(OUT / arguments.what, ignore_errors=True)
     (OUT / arguments.what).mkdir(parents=True)
-    {"speed": speed, "kills": kills, "many": many}[arguments.what](OUT / arguments.what, arguments.tiny)
+    title, measure = {
+        "speed": ("A sweep of 16 members beside 16 runs", speed),
+        "kills": ("A sweep that was killed five times", kills),
+        "many": ("A thousand members of a small program", many),
+    }[arguments.what]
+    found = measure(OUT / arguments.what, arguments.tiny)
+    command = (
+        f"Command: `python experiments/sweeping.py {arguments.what}`. {platform.machine()} CPU, {xla.cores()} cores."
+    )
+    print(found)
+    if not arguments.tiny:
+        files.write_text(RESULTS / f"sweeping_{arguments.what}.md", f"# {title}\n\n{command}\n\n{found}\n")
 
 
-def speed(out: Path, tiny: bool) -> None:
+def speed(out: Path, tiny: bool) -> str:
     """Wall time of both, programs compiled and kept by one short run before, and how far their results are apart."""
     settings = TINY if tiny else {}
     options = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
@@ -56,28 +70,40 @@ def speed(out: Path, tiny: bool) -> None:
     started = time.monotonic()
     subprocess.run(sweep_command(out, {"actor_lr": list(rates), "seed": list(seeds)}, settings), check=True)
     together = time.monotonic() - started
-    worst = 0.0
+    worst, met = 0.0, 0.0
     for run in Sweep.open(out / "sweep").runs.values():
         same = Run.open(out / f"{run.config.ddpg.actor_lr}-{run.config.train.seed}")
         worst = max(worst, *(abs(a - b) for a, b in zip(run.metrics["reward"], same.metrics["reward"], strict=True)))
-    print(f"alone {alone:.0f} s, sweep {together:.0f} s, ratio {together / alone:.2f}; rewards differ by {worst:.2g}")
+        ours, theirs = (one.evaluations[-1]["one_shot"]["within"]["10"] for one in (run, same))
+        met = max(met, abs(ours - theirs))
+    return (
+        f"One after the other {alone:.0f} s, as a sweep {together:.0f} s: **{together / alone:.2f}** of the time, with "
+        f"compilation and evaluations.\nThe curves of rewards differ by {worst:.2g} at most, the shares within 10 mm "
+        f"at the end by {met:.2g} points."
+    )
 
 
-def kills(out: Path, tiny: bool) -> None:
+def kills(out: Path, tiny: bool) -> str:
     """The table of a sweep killed five times, against that of one that never was."""
     settings = {**TINY, "episodes": 10 if tiny else 50}
     axes = {"actor_lr": list(RATES), "seed": [0, 1]}
     subprocess.run(sweep_command(out / "whole", axes, settings), check=True)
+    done: list[int] = []
     command, moments = [*sweep_command(out / "killed", axes, settings), "--resume"], random.Random()
     for _ in range(5):
         started = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         time.sleep(moments.uniform(5, 25))
         started.send_signal(signal.SIGKILL)
         started.wait()
-        print(f"killed with {len(list((out / 'killed/sweep/members').glob('*.json')))} of 8 members at their end")
+        done.append(len(list((out / "killed/sweep/members").glob("*.json"))))
+        print(f"killed with {done[-1]} of 8 members at their end")
     subprocess.run(command, check=True)
     tables = [table(out / name / "sweep") for name in ("whole", "killed")]
-    print("the same table" if tables[0] == tables[1] else "THE TABLES DIFFER", f"of {len(tables[0])} rows")
+    same = "The table is that" if tables[0] == tables[1] else "THE TABLE IS NOT THAT"
+    at = ", ".join(map(str, done))
+    return (
+        f"Killed (SIGKILL) when {at} of 8 members were done. {same} of a sweep never killed, of {len(tables[0])} rows."
+    )
 
 
 def table(folder: Path) -> list[dict]:
@@ -86,8 +112,9 @@ def table(folder: Path) -> list[dict]:
     return [{name: value for name, value in row.items() if name not in ("seconds", "revision")} for row in rows]
 
 
-def many(out: Path, tiny: bool) -> None:
+def many(out: Path, tiny: bool) -> str:
     """Seconds a member, and the workers' memory, as the sweep goes on."""
+    lines = ["| members | s a member so far | MB of the driver and of each worker |", "| ---: | ---: | --- |"]
     count = 40 if tiny else 1000
     started, last = time.monotonic(), 0
     process = subprocess.Popen(sweep_command(out, {"seed": {"count": count}}, TINY), stderr=subprocess.DEVNULL)
@@ -101,10 +128,11 @@ def many(out: Path, tiny: bool) -> None:
                 memory = [round(p.memory_info().rss / 1e6) for p in (psutil.Process(process.pid), *workers)]
             except psutil.Error:
                 memory = []
-            print(
-                f"{done} members, {(time.monotonic() - started) / done:.2f} s each, MB of driver and workers {memory}"
-            )
-    print(f"{len(Sweep.open(out / 'sweep').table)} rows in {time.monotonic() - started:.0f} s")
+            each, used = f"{(time.monotonic() - started) / done:.2f}", ", ".join(map(str, memory))
+            lines.append(f"| {done} | {each} | {used} |")
+            print(lines[-1])
+    rows, took = len(Sweep.open(out / "sweep").table), time.monotonic() - started
+    return "\n".join([*lines, "", f"One table of {rows} rows, after {took:.0f} s."])
 
 
 def sweep_command(out: Path, axes: dict, settings: dict) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,10 @@ xla.enable_compilation_cache()
 if TYPE_CHECKING:
     from arm5dof.arm import Arm
     from arm5dof.envs.reach import Reach
+
+# What runs in the background of a script ignores interrupts, and so does all that it starts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("arm5dof", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("arm5dof")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -29,7 +31,8 @@ PATIENCE_S = 2.0
 class Bar:
     """A progress bar on stderr with rate, ETA and a note; where stderr is no terminal, a line every ten seconds.
 
-    `total` is None where nobody knows it: then there is no ETA.
+    `total` is None where nobody knows it: then there is no ETA. An interrupt (Ctrl-C) that gets lost while it is shown,
+    as in a callback of the garbage collector, of which JAX has one, is raised again by the next `update`.
     """
 
     def __init__(self, what: str, total: int | None, unit: str, done: int = 0) -> None:
@@ -53,16 +56,29 @@ class Bar:
             redirect_stdout=sys.stdout.isatty(),
         )
         self._task = self._progress.add_task(what, total=total, completed=done, note="")
+        self._listens = self._interrupted = False
 
     def __enter__(self) -> Bar:
         self._progress.start()
+        main = threading.current_thread() is threading.main_thread()
+        self._listens = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if self._listens:
+            signal.signal(signal.SIGINT, self._interrupt)
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._listens:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         self._progress.stop()
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted = True
+        raise KeyboardInterrupt
 
     def update(self, done: int, note: str = "") -> None:
         """Move to `done` and show a note."""
+        if self._interrupted:
+            raise KeyboardInterrupt
         self.done = done
         self._progress.update(self._task, completed=done, note=note)
         now = time.monotonic()

@@ -14,7 +14,7 @@ from arm5dof.errors import UserError
 from arm5dof.grasp.gripper import SITE
 from arm5dof.grasp.perception import SeenObject
 from arm5dof.grasp.scene import ARM_BIT, TabletopScene, tabletop_scene
-from arm5dof.grasp.world import STEP, Held, World, dense
+from arm5dof.grasp.world import MARGINS, STEP, Held, World, dense
 from arm5dof.vision.objects import CATALOGUE, CLASS_NAMES
 from arm5dof.vision.rendering.simulated import simulated_camera
 from arm5dof.vision.synthetic.scene_builder import CAMERA
@@ -129,8 +129,9 @@ def test_dense_paths_keep_their_poses_and_take_small_steps():
 
 
 def hidden(scene: TabletopScene, radii: tuple[float, float]) -> float:
-    """The share of the table, where objects may lie, that the arm hides from the camera."""
-    radius, azimuth = np.meshgrid(np.linspace(*radii, 12), np.deg2rad(np.linspace(-100, 100, 60)))
+    """The share of the table, where objects may lie and a little around, that the arm hides from the camera."""
+    near, far = radii[0] - MARGINS[0], radii[1] + MARGINS[1]
+    radius, azimuth = np.meshgrid(np.linspace(near, far, 12), np.deg2rad(np.linspace(-100, 100, 60)))
     points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full_like(radius, 0.02)], -1)
     pixels = np.round(np.asarray(scene.camera.project(points.reshape(-1, 3)))).astype(int)
     mujoco.mj_forward(scene.model, scene.data)

@@ -110,7 +110,7 @@ def interruptible() -> Iterator[list[int]]:
         interrupts.append(number)
         signal.signal(signal.SIGINT, before)
 
-    if before is signal.default_int_handler:  # It is another where Ctrl-C is to be ignored, as in the background.
+    if callable(before):  # It is a constant where Ctrl-C is to be ignored, as in the background.
         signal.signal(signal.SIGINT, interrupt)
     try:
         yield interrupts
