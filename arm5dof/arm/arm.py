@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -62,9 +63,11 @@ class Arm:
     """Id of the end-effector site."""
     lower: np.ndarray
     upper: np.ndarray
-    """Joint limits, (dof,), narrowed to what the position actuators can be told; a turn where there are none."""
-    continuous: tuple[bool, ...]
-    """Which joints are hinges without limits, whose position is an angle modulo a turn, (dof,)."""
+    """Between what joint positions are asked for, (dof,): the joints' `stops`, but one turn where they allow more."""
+    stops: np.ndarray
+    """Joint limits, (dof, 2), narrowed to what the position actuators can be told; infinite where there are none."""
+    turns: tuple[bool, ...]
+    """Which joints are hinges that can make more than a turn, whose position is an angle modulo a turn, (dof,)."""
     chain: tuple[Link, ...]
     """What stands between the joints, (dof + 1,): the last leads from the last joint to the site."""
     reach: float
@@ -76,13 +79,20 @@ class Arm:
     """Names of the joints that were taken out to hold the base."""
 
     @cached_property
+    def free_model(self) -> mujoco.MjModel:
+        """The model with contacts off, which cost time and memory: an arm on its way to a point has none to make."""
+        model = copy.copy(self.mj_model)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        return model
+
+    @cached_property
     def mjx_model(self) -> mjx.Model:
-        """The model as MJX has it. Raises `UserError` if it has something that MJX cannot simulate."""
+        """`free_model` as MJX has it. Raises `UserError` if it has something that MJX cannot simulate."""
         from arm5dof.runtime.mjx import mjx  # Half a second to import, and nothing but servo dynamics needs it.
 
         try:
             with jax.ensure_compile_time_eval():  # It may be wanted first while a program is traced.
-                return mjx.put_model(self.mj_model)
+                return mjx.put_model(self.free_model)
         except Exception as error:  # NotImplementedError mostly, or whatever MJX's own code runs into.
             change = 'give such geoms contype="0" conaffinity="0"' if "collisions" in str(error) else "change it"
             raise UserError(f"MJX cannot simulate this model ({error}): {change}, or use kinematic dynamics") from None
@@ -226,8 +236,8 @@ class Arm:
         for name, slides, endless, limits, driver in zip(
             self.joint_names,
             self.slides,
-            self.continuous,
-            np.stack([self.lower, self.upper], axis=1),
+            np.isinf(self.stops).any(-1),
+            np.where(np.isinf(self.stops).any(-1, keepdims=True), np.stack([self.lower, self.upper], 1), self.stops),
             self.actuation,
             strict=True,
         ):

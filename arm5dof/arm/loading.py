@@ -70,7 +70,7 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = ""
 
     actuators = np.array([position_actuator(model, j) for j in ids])
     servo = np.array([servo_line(model, a) for a in actuators])
-    lower, upper, continuous = _limits(model, ids, actuators, servo)
+    lower, upper, stops, turns = _limits(model, ids, actuators, servo)
     chain = fold(model, path, site_id)
     if not moves(chain, lower, upper):
         raise UserError(
@@ -90,7 +90,8 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = ""
         site=site_id,
         lower=lower,
         upper=upper,
-        continuous=continuous,
+        stops=stops,
+        turns=turns,
         chain=chain,
         reach=float(sum(np.linalg.norm(link.offset) for link in chain[1:]) + travel.sum()),
         why_site=why,
@@ -103,26 +104,22 @@ def load_arm(source: str | Path | mujoco.MjSpec | mujoco.MjModel, site: str = ""
 
 def _limits(
     model: mujoco.MjModel, ids: np.ndarray, actuators: np.ndarray, servo: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[bool, ...]]:
-    """The joints' ranges where their actuators' control ranges allow them, and which of them are whole turns of a
-    hinge without limits. Raises `UserError` if nothing is left."""
-    lower, upper = model.jnt_range[ids].T.copy()
-    continuous = []
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[bool, ...]]:
+    """Of each joint the least and the most that is asked for, its stops, and whether it can make more than a turn:
+    then the turn is asked for that is next to -pi to pi. Raises `UserError` if an actuator can be told nothing."""
+    stops = np.where(model.jnt_limited[ids, None].astype(bool), model.jnt_range[ids], [-np.inf, np.inf])
     for k, a in enumerate(actuators):
-        endless = model.jnt_type[ids[k]] == HINGE and not model.jnt_limited[ids[k]]
-        if endless:
-            lower[k], upper[k] = -np.pi, np.pi
         if a >= 0 and model.actuator_ctrllimited[a]:
             told = np.sort((model.actuator_ctrlrange[a] - servo[k, 1]) / servo[k, 0])
-            if endless:  # The turn next to -pi to pi that the actuator can be told.
-                shift = np.clip(0, *np.sort([told[0] + np.pi, told[1] - np.pi]))
-                lower[k], upper[k] = shift - np.pi, shift + np.pi
-            lower[k], upper[k] = max(lower[k], told[0]), min(upper[k], told[1])
-        if not lower[k] < upper[k]:
+            stops[k] = max(stops[k, 0], told[0]), min(stops[k, 1], told[1])
+        if not stops[k, 0] < stops[k, 1]:
             name = joint_name(model, ids[k])
             raise UserError(f"joint {name!r} cannot move: its range and its actuator's ctrlrange leave nothing")
-        continuous.append(bool(endless and upper[k] - lower[k] > 2 * np.pi - 1e-9))
-    return lower, upper, tuple(continuous)
+    lower, upper = stops.T.copy()
+    turns = (model.jnt_type[ids] == HINGE) & (upper - lower > 2 * np.pi + 1e-6)
+    shift = np.where(upper < np.pi, upper - np.pi, np.where(lower > -np.pi, lower + np.pi, 0.0))
+    lower, upper = np.where(turns, shift - np.pi, lower), np.where(turns, shift + np.pi, upper)
+    return lower, upper, stops, tuple(turns.tolist())
 
 
 def _compile(source: str | Path | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjSpec | None, mujoco.MjModel]:

@@ -49,14 +49,13 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
         writable(args.figure, (".png",))
     from arm5dof.arm import load_arm
-    from arm5dof.arm.settling import settle_steps
 
     arm = load_arm(args.file, args.site, args.base)
     if not args.json:
         print(arm.table().text(), flush=True)  # MJX takes its time with a robot that has many contacts.
     dynamics = {name: _try(args, name) for name in ("kinematic", "servo")}
-    steps = settle_steps(arm) if dynamics["servo"]["works"] else None
-    dynamics["servo"]["settle_steps"] = steps
+    if dynamics["servo"]["works"]:
+        dynamics["servo"].update(_settling(arm))
     if args.json:
         print(json.dumps(_as_json(arm, dynamics)))
     else:
@@ -78,24 +77,39 @@ def _try(args: argparse.Namespace, dynamics: str) -> dict[str, Any]:
     return {"works": True, "reason": None, "substeps": config.env.substeps}
 
 
+def _settling(arm: Arm) -> dict[str, Any]:
+    """How long the servos take, and for which joints they are computed."""
+    from arm5dof.arm.computed_servos import with_servos
+    from arm5dof.arm.servos import Servos
+
+    steps = Servos(with_servos(arm)).settle_steps
+    computed = [name for name, a in zip(arm.joint_names, arm.actuators, strict=True) if a < 0]
+    return {
+        "settle_steps": steps,
+        "settle_seconds": None if steps is None else steps * arm.mj_model.opt.timestep,
+        "computed": computed,
+    }
+
+
 def _servos(servo: dict[str, Any]) -> str:
     """Whether they can be trained, and whether an action gets where it asks for."""
     if not servo["works"]:
         return f"no, {servo['reason']}"
-    steps, substeps = servo["settle_steps"], servo["substeps"]
+    computed = f" computed for {', '.join(servo['computed'])}" if servo["computed"] else ""
+    steps = servo["settle_steps"]
     if steps is None:
-        return "yes, but the servos do not come within 1 % of where they are told: stiffen them, or compensate gravity"
-    if steps > substeps:
-        return (
-            f"yes, but the servos take {steps} physics steps to come within 1 % of where they are told, and a control "
-            f"step has substeps = {substeps}"
-        )
-    return f"yes, the servos come within 1 % of where they are told in {steps} physics steps (substeps = {substeps})"
+        return f"yes, but the servos{computed} do not come to rest: give them damping, or stiffen them"
+    settled = f"yes, the servos{computed} settle in {steps} physics steps ({servo['settle_seconds']:.2f} s)"
+    if steps > servo["substeps"]:
+        return f"{settled}, too many for MJX to simulate at every transition: C MuJoCo measures what was learnt"
+    return f"{settled}, which MJX simulates at every transition"
 
 
 def _as_json(arm: Arm, dynamics: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    import numpy as np
+
     base, position, rotation = arm.base
-    columns = (arm.joint_names, arm.slides, arm.continuous, arm.lower, arm.upper, arm.actuation)
+    columns = (arm.joint_names, arm.slides, np.isinf(arm.stops).any(-1), arm.lower, arm.upper, arm.actuation)
     return {
         "end_effector": arm.mj_model.site(arm.site).name,
         "chosen": arm.why_site or None,

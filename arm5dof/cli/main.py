@@ -16,7 +16,7 @@ from arm5dof.errors import UserError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command. Returns the exit status: 0, 2 for bad input, 130 when interrupted."""
+    """Run a command. Returns the exit status: 0, 1 for what came to nothing, 2 for bad input, 130 when interrupted."""
     warnings.showwarning = lambda message, *_, **__: print(f"arm5dof: {message}", file=sys.stderr)
     try:
         parser = make_parser()

@@ -37,6 +37,8 @@ A resumed run may have other episodes, evaluate_every, checkpoint_every, targets
 correction, branches, restarts and refinements; every other setting is as it was. More episodes stretch what
 falls over the training: 400 of 400 become 400 of 800, and step sizes, noise and the share of random actions
 rise again to where they stand half-way.
+
+Exit status 1 if the policy reaches nothing at all, 2 for bad input.
 """
 
 SMOKE = {
@@ -72,8 +74,8 @@ def declare(commands: argparse._SubParsersAction) -> None:
     p.set_defaults(run=run, parser=p)
 
 
-def run(args: argparse.Namespace, rest: list[str]) -> None:
-    """`arm5dof train`."""
+def run(args: argparse.Namespace, rest: list[str]) -> int:
+    """`arm5dof train`. Returns the exit status, 1 for a policy that is of no use."""
     experiment, texts = _experiment_and_settings(rest)
     if args.tool is not None:
         if "site" in texts:
@@ -121,6 +123,9 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         raise
     print(tables(current.env.metrics, current.evaluations[-1]))
     print(f"figure and report: {current.folder / 'report.md'}")
+    if failure := current.env.failure(current.evaluations[-1]):
+        print(f"arm5dof: {failure}", file=sys.stderr)
+    return int(bool(failure))
 
 
 def _configure(experiment: str, texts: dict[str, str], smoke: bool) -> Config:

@@ -7,7 +7,7 @@ A task says what a goal is (`forward`, `encode`, `decode`), how far one is from 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,11 @@ import numpy as np
 from annotated_types import Ge
 
 from arm5dof.arm import Arm, load_arm
+from arm5dof.arm.computed_servos import with_servos
+from arm5dof.arm.servos import MOST_S, Servos
 from arm5dof.envs.base import Act, Goal, Observation, State, Task
-from arm5dof.envs.inverse_kinematics import choose, solve
+from arm5dof.envs.episodes import corrected, settled
+from arm5dof.envs.inverse_kinematics import solve
 from arm5dof.envs.metrics import Error
 from arm5dof.envs.physics import Physics
 from arm5dof.errors import UserError
@@ -39,12 +42,17 @@ class ArmGoalConfig:
     base: str = static(default="")
     """A body of that file that is held still, with all that carries it: of an arm on a mobile or free base."""
     dynamics: Literal["servo", "kinematic"] = static(default="servo")
-    """servo: an action is the position actuators' target and MJX physics moves the arm there; kinematic: an action
-    is the pose itself, the paper's setting."""
+    """servo: an action is the position actuators' target and physics moves the arm there; kinematic: an action is the
+    pose itself, the paper's setting."""
+    servo: Literal["auto", "model"] = static(default="auto")
+    """auto: joints that the model gives no position actuator (torque motors, nothing) get one that is computed from
+    the arm's inertia, critically damped; model: such arms are refused (servo dynamics)."""
     episode_length: Annotated[int, Ge(1)] = static(default=160)
     """Control steps in an episode; its end is a truncation."""
     substeps: Annotated[int, Ge(1)] = static(default=5)
-    """Physics steps in a control step (servo): long enough for the servos to settle to within 1 %."""
+    """Physics steps in a control step (servo), which MJX simulates if the servos settle in so many. Slower servos are
+    taken to have settled by the end of a control step, and `episode` is measured in C MuJoCo, whose steps are long
+    enough for the arm to come to rest."""
     correction: Literal["target", "jacobian"] = static(default="target", may_change=True)
     """How answers are corrected. target: the policy is asked again, for a goal shifted by the error; jacobian: damped
     least squares from the policy's answer, which also finds the nearest that the joint limits allow."""
@@ -60,8 +68,8 @@ class ArmGoalEnv(Task):
     """A `ForwardModel`: pure `reset(key)` and `step(state, action)`, no batch axis.
 
     Observations are dimensionless: points are relative to the arm's origin in units of its reach, joint positions in
-    units of half their range ([-1, 1]), and for joints without limits cosines, then sines. The actor sees the goal; the
-    critic's `privileged_state` is the paper's: joint angles, what is achieved, the goal.
+    units of half their range ([-1, 1]), and for joints that can make more than a turn cosines, then sines. The actor
+    sees the goal; the critic's `privileged_state` is the paper's: joint angles, what is achieved, the goal.
     """
 
     config: ArmGoalConfig
@@ -77,19 +85,43 @@ class ArmGoalEnv(Task):
         """
         super().__init__(config)
         loaded = arm if isinstance(arm, Arm) else load_arm(config.arm if arm is None else arm, config.site, config.base)
-        self.arm = arm = loaded
-        if config.dynamics == "servo" and (arm.actuators < 0).any():
-            lacking = [repr(name) for name, a in zip(arm.joint_names, arm.actuators, strict=True) if a < 0]
-            drivers = sorted({d for d, a in zip(arm.actuation, arm.actuators, strict=True) if a < 0})
-            raise UserError(
-                f"joint {', '.join(lacking)} has no position actuator (but {', '.join(drivers)}): add one to the MJCF, "
-                'or choose dynamics = "kinematic"'
-            )
-        endless = np.array(arm.continuous)
+        self.arm = loaded
+        self._servos: Servos | None = None
+        self._notes: list[str] = []
+        if config.dynamics == "servo":
+            self._find_servos()
+        arm = self.arm
+        endless = np.array(arm.turns)
         self._limited, self._endless = np.flatnonzero(~endless), np.flatnonzero(endless)
         self._origin = arm.origin
         body = mujoco.mj_name2id(arm.mj_model, mujoco.mjtObj.mjOBJ_BODY, "target")
         self._marker = int(arm.mj_model.body_mocapid[body]) if body >= 0 else -1
+
+    def _find_servos(self) -> None:
+        """Give joints that lack them computed servos, and find out how long servos take: `_servos` are slow ones."""
+        driven = zip(self.arm.joint_names, self.arm.actuation, self.arm.actuators, strict=True)
+        lacking = [(name, driver) for name, driver, a in driven if a < 0]
+        if lacking:
+            names, drivers = ", ".join(repr(name) for name, _ in lacking), ", ".join(sorted({d for _, d in lacking}))
+            if self.config.servo == "model":
+                raise UserError(
+                    f"joint {names} has no position actuator (but {drivers}): add one to the MJCF, choose "
+                    'servo = "auto", which computes one, or dynamics = "kinematic"'
+                )
+            self.arm = with_servos(self.arm)
+            self._notes.append(f"servos computed for {names} (driven by {drivers}), critically damped")
+        servos = Servos(self.arm)
+        steps = servos.settle_steps
+        if steps is None:
+            self._notes.append(f"the servos do not come to rest in {MOST_S:g} s: expect little of the episode figure")
+        if steps is None or steps > self.config.substeps:
+            self._servos = servos
+        if steps is not None and self._servos:
+            seconds = steps * self.arm.mj_model.opt.timestep
+            self._notes.append(
+                f"the servos settle in {steps} physics steps ({seconds:.2f} s): the policy learns where they settle, "
+                "and the episode figure is measured in C MuJoCo"
+            )
 
     # What a goal is: for each task to say.
 
@@ -165,13 +197,13 @@ class ArmGoalEnv(Task):
 
     def check(self) -> None:
         """Raise `UserError` if MJX is to simulate the arm and cannot."""
-        if self.config.dynamics == "servo":
+        if self._simulates:
             Physics.check(self.arm.mj_model, self.arm.mjx_model)
 
     @property
     def about(self) -> str:
         """See `Task`: the arm."""
-        return self.arm.table().text()
+        return "\n".join([self.arm.table().text(), *self._notes])
 
     def reset(self, key: jax.Array) -> State:
         """A random pose and a fresh, reachable goal: forward kinematics of another random pose."""
@@ -196,12 +228,22 @@ class ArmGoalEnv(Task):
         """One control step. `action` is (dof,) in [-1, 1], mapped to joint targets inside the limits."""
         action = jnp.clip(action, -1, 1)
         target = self.arm.to_joints(action)
-        data, goal = state.data, state.info["goal"]
-        if self.config.dynamics == "servo":
+        data = state.data
+        if self._simulates:
             data = data.replace(ctrl=data.ctrl.at[self.arm.actuators].set(self.arm.to_ctrl(target)))
             data = jax.lax.fori_loop(0, self.config.substeps, lambda _, d: d.step(self.arm.mjx_model), data)
         else:
             data = data.replace(qpos=data.qpos.at[self.arm.qpos].set(target))
+        return self.arrived(state, data, action)
+
+    @property
+    def _simulates(self) -> bool:
+        """Whether MJX simulates every step."""
+        return self.config.dynamics == "servo" and self._servos is None
+
+    def arrived(self, state: State, data: Physics, action: jax.Array) -> State:
+        """The state after an action that led from a state to some physics."""
+        goal = state.info["goal"]
         obs, achieved = self._observe(data, goal)
         reward, done = self.goal_reward(achieved, goal, action)
         metrics = {**state.metrics, **self.errors(achieved, goal)}
@@ -239,8 +281,12 @@ class ArmGoalEnv(Task):
         return self.arm.slides
 
     @property
-    def continuous(self) -> tuple[bool, ...]:
-        return self.arm.continuous
+    def turns(self) -> tuple[bool, ...]:
+        return self.arm.turns
+
+    @property
+    def stops(self) -> np.ndarray:
+        return self.arm.stops
 
     @property
     def branches(self) -> int:
@@ -284,7 +330,8 @@ class ArmGoalEnv(Task):
         - `one_shot`: one answer of the policy, by forward kinematics;
         - `refined`: the same with closed-loop target correction (`solve`);
         - `episode`: the last step of an episode from a random pose, in the environment, corrected in its first steps by
-          the error that the arm then shows. Infinite where physics blew up.
+          the error that the arm then shows; with slow servos, in C MuJoCo, the arm at rest after the `refined` answer,
+          which is told again as often with what the joints lack. Infinite where physics blew up.
 
         By the name of the kind for the first component of the errors, followed by that of the component for others;
         and `initial`, the errors before the first step.
@@ -292,10 +339,15 @@ class ArmGoalEnv(Task):
         goal_key, pose_key = jax.random.split(key)
         goals = jax.vmap(self.sample_goal)(jax.random.split(goal_key, n))
         state = jax.vmap(self.start)(self.arm.sample(pose_key, (n,)), goals)
+        refined = solve(self, act, goals, self.config.refinements)
+        if self._servos:
+            episode = settled(self, self._servos, refined.answer.q, state, self.config.refinements)
+        else:
+            episode = corrected(self, act, state, goals, self.config.refinements)
         kinds = {
             "one_shot": solve(self, act, goals, 0).answer.errors,
-            "refined": solve(self, act, goals, self.config.refinements).answer.errors,
-            "episode": self._episode(act, state, goals),
+            "refined": refined.answer.errors,
+            "episode": episode,
             "initial": state.metrics,
         }
         return {
@@ -309,25 +361,24 @@ class ArmGoalEnv(Task):
         goals = jax.vmap(self.sample_goal)(jax.random.split(key, PROBES))
         return {f"policy_{name}": values.mean() for name, values in solve(self, act, goals, 0).answer.errors.items()}
 
-    def _episode(self, act: Act, state: State, goals: Goal) -> dict[str, jax.Array]:
-        branch = act.branch(state.obs)
+    def failure(self, results: Mapping[str, Any]) -> str:
+        """See `Task`: not one goal was reached, and the errors are about those of an arm that does not move."""
 
-        def step(now: CorrectionState, correcting: jax.Array) -> tuple[CorrectionState, None]:
-            asked = choose(jnp.broadcast_to(correcting, now.reward.shape), now.asked, now.best)
-            obs = jax.vmap(self.replace_goal)(now.state.obs, asked)
-            state = jax.vmap(self.step)(now.state, act(obs, branch))
-            better = correcting & (state.reward > now.reward)
-            return CorrectionState(
-                state=state,
-                asked=jax.vmap(self.correct)(asked, jax.vmap(self.achieved)(state.obs), goals),
-                best=choose(better, asked, now.best),
-                reward=jnp.where(better, state.reward, now.reward),
-            ), None
+        def fails(kind: str) -> bool:
+            metric = self.metrics[kind]
+            assert isinstance(metric, Error)
+            still = metric.scale * results["means"]["initial"]
+            reached = results[kind]["within"][f"{metric.within[-1]:g}"]
+            return bool(reached == 0 and not metric.number(results[kind]) < still / 2)
 
-        correcting = jnp.arange(self.episode_length) <= self.config.refinements
-        start = CorrectionState(state, goals, goals, jnp.full(len(state.reward), -jnp.inf))
-        final, _ = jax.lax.scan(step, start, correcting)
-        return {name: jnp.where(jnp.isfinite(values), values, jnp.inf) for name, values in final.state.metrics.items()}
+        if self.config.dynamics == "servo" and fails("episode") and not fails("one_shot"):
+            return (
+                "the policy's answers are right, but the servos do not bring the arm there: stiffen or damp them, or "
+                'choose dynamics = "kinematic"'
+            )
+        if fails("one_shot"):
+            return "the policy reaches nothing: train it for longer, or choose other step sizes"
+        return ""
 
     def _observe(self, data: Physics, goal: Goal) -> tuple[Observation, Goal]:
         """The observation, and what the end effector has reached."""
@@ -357,12 +408,3 @@ class ArmGoalEnv(Task):
 
     def _unscaled(self, points: jax.Array) -> jax.Array:
         return points * self.arm.reach + self._origin
-
-
-class CorrectionState(NamedTuple):
-    """Episodes under way: the goal to ask for next, the one that led closest so far, and the reward there."""
-
-    state: State
-    asked: Goal
-    best: Goal
-    reward: jax.Array

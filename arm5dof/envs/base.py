@@ -152,6 +152,11 @@ class Task(ABC):
         """What people should know of it before a training, lines of text: which robot it is, and how it was read."""
         return ""
 
+    def failure(self, results: Mapping[str, Any]) -> str:
+        """Why what was measured (`arm5dof.training.evaluate.Results`) says that the policy is of no use at all, in one
+        line of text; empty if it does not say so."""
+        return ""
+
     @property
     def fingerprint(self) -> tuple[object, ...] | None:
         """All that the environment's functions depend on but this package's source, so that its compiled programs can
@@ -218,8 +223,14 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
-    def continuous(self) -> tuple[bool, ...]:
-        """Which of them are angles modulo a turn, since the joint has no limits."""
+    def turns(self) -> tuple[bool, ...]:
+        """Which of them are angles modulo a turn, since the joint can make more than one. Their actions from -1 to 1
+        are a turn."""
+        ...
+
+    @property
+    def stops(self) -> np.ndarray:
+        """How far the joints go, (dof, 2); infinite where nothing limits them."""
         ...
 
     @property

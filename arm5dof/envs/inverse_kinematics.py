@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from arm5dof.envs.base import Act, ForwardModel, Goal
 
@@ -42,11 +43,11 @@ class Candidate(NamedTuple):
 
 def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candidate:
     """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose: its preferred answer, or
-    with `corrections` > 0 of all `candidates` the one of the highest reward."""
+    with `corrections` > 0 of all `candidates` the one of the highest reward, and where that misses the `nearest`."""
     if corrections:
         found = candidates(env, act, goals, corrections, env.branches)
         best = found.reward.argmax(0)
-        return jax.tree.map(lambda x: x[best, jnp.arange(len(best))], found)
+        return nearest(env, act, goals, jax.tree.map(lambda x: x[best, jnp.arange(len(best))], found))
     return _judge(env, goals, act(jax.vmap(env.question)(goals)))
 
 
@@ -135,19 +136,25 @@ def _judge(env: ForwardModel, goals: Goal, action: jax.Array) -> Candidate:
 
 def _descend(env: ForwardModel, steps: int, action: jax.Array, goal: Goal) -> jax.Array:
     """Levenberg-Marquardt from one action (action_size,) to where the residual is smallest within [-1, 1]. An action
-    at a limit that it would cross stays there for that step."""
+    at a limit that it would cross stays there for that step; that of a joint that turns comes in again at the other."""
+    turns = np.array(env.turns)
 
     def residual(action: jax.Array) -> jax.Array:
         return env.residual(env.outcome(action), goal)
+
+    def within(action: jax.Array) -> jax.Array:
+        limited = jnp.clip(action, -1, 1)
+        return jnp.where(turns, (action + 1) % 2 - 1, limited) if turns.any() else limited
 
     def step(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], None]:
         action, damping = carry
         now, jacobian = residual(action), jax.jacfwd(residual)(action)
         gradient = jacobian.T @ now
         free = (jnp.abs(action) < 1) | (action * gradient > 0)
+        free = free | turns if turns.any() else free
         jacobian = jacobian * free
         normal = jacobian.T @ jacobian + jnp.diag(jnp.where(free, damping, 1.0))
-        moved = jnp.clip(action - jnp.linalg.solve(normal, gradient * free), -1, 1)
+        moved = within(action - jnp.linalg.solve(normal, gradient * free))
         better = (residual(moved) ** 2).sum() < (now**2).sum()
         return (jnp.where(better, moved, action), damping * jnp.where(better, 0.1, 10.0)), None
 

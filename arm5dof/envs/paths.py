@@ -31,30 +31,30 @@ class Path(NamedTuple):
     """Whether a joint has moved by more than `JUMP` since the goal before, (n,) bool."""
 
 
-def moved(a: np.ndarray, b: np.ndarray, continuous: Sequence[bool]) -> np.ndarray:
-    """From one pose to another by the shorter way, (..., dof): of joints that are continuous modulo a turn."""
+def moved(a: np.ndarray, b: np.ndarray, turns: Sequence[bool]) -> np.ndarray:
+    """From one pose to another by the shorter way, (..., dof): of joints that turn modulo a turn."""
     way = b - a
-    return np.where(continuous, (way + np.pi) % (2 * np.pi) - np.pi, way)
+    return np.where(turns, (way + np.pi) % (2 * np.pi) - np.pi, way)
 
 
-def chain(q: np.ndarray, met: np.ndarray, continuous: Sequence[bool], start: np.ndarray | None = None) -> np.ndarray:
+def chain(q: np.ndarray, met: np.ndarray, turns: Sequence[bool], start: np.ndarray | None = None) -> np.ndarray:
     """Choose one of several poses at each goal of a line: the fewest goals missed, then the fewest jumps, then the
     shortest way of the joints (Viterbi's algorithm).
 
     Args:
         q: Joint positions, (k, n, dof), radians.
         met: Which of them meet their goal, (k, n) bool.
-        continuous: Which joints are angles modulo a turn, (dof,).
+        turns: Which joints are angles modulo a turn, (dof,).
         start: Where the arm is, (dof,), from where the way is counted too; None for anywhere.
 
     Returns:
         Which pose, (n,) int.
     """
     missed = np.where(met, 0.0, MISSED)
-    cost = missed[:, 0] + (0.0 if start is None else np.abs(moved(start, q[:, 0], continuous)).sum(-1))
+    cost = missed[:, 0] + (0.0 if start is None else np.abs(moved(start, q[:, 0], turns)).sum(-1))
     back = []
     for before, here, miss in zip(q[:, :-1].swapaxes(0, 1), q[:, 1:].swapaxes(0, 1), missed[:, 1:].T, strict=True):
-        way = np.abs(moved(before[:, None], here, continuous))
+        way = np.abs(moved(before[:, None], here, turns))
         through = cost[:, None] + way.sum(-1) + JUMPED * (way.max(-1) > JUMP)
         back.append(through.argmin(0))
         cost = through.min(0) + miss
@@ -69,30 +69,34 @@ def jumps(q: np.ndarray) -> np.ndarray:
     return np.append(False, np.abs(np.diff(q, axis=0)).max(-1) > JUMP)
 
 
-def beside(q: np.ndarray, near: np.ndarray, continuous: Sequence[bool]) -> np.ndarray:
-    """The same poses, (..., dof), whose continuous joints make no turn more than they need from others."""
-    return np.where(continuous, near + moved(near, q, continuous), q)
+def beside(q: np.ndarray, near: np.ndarray, turns: Sequence[bool], stops: np.ndarray) -> np.ndarray:
+    """The same poses, (..., dof), whose joints that turn make no turn more than they need from others, and none beyond
+    their stops (dof, 2)."""
+    there = near + moved(near, q, turns)
+    there = there - 2 * np.pi * np.ceil(np.maximum(there - stops[:, 1], 0) / (2 * np.pi))
+    there = there + 2 * np.pi * np.ceil(np.maximum(stops[:, 0] - there, 0) / (2 * np.pi))
+    return np.where(turns, there, q)
 
 
-def unwound(q: np.ndarray, continuous: Sequence[bool]) -> np.ndarray:
-    """Poses along a line, (n, dof), whose continuous joints count the turns that they make from the first on."""
-    way = np.cumsum(moved(q[:-1], q[1:], continuous), axis=0)
-    return np.concatenate([q[:1], np.where(continuous, q[0] + way, q[1:])])
+def unwound(q: np.ndarray, turns: Sequence[bool], stops: np.ndarray) -> np.ndarray:
+    """Poses along a line, (n, dof), whose joints that turn count on from the first, as far as their stops (dof, 2)."""
+    line = [q[0]]
+    for pose in q[1:]:
+        line.append(beside(pose, line[-1], turns, stops))
+    return np.stack(line)
 
 
-def nearest(
-    q: np.ndarray, met: np.ndarray, reward: np.ndarray, continuous: Sequence[bool], near: np.ndarray
-) -> np.ndarray:
+def nearest(q: np.ndarray, met: np.ndarray, reward: np.ndarray, turns: Sequence[bool], near: np.ndarray) -> np.ndarray:
     """Which of several answers (k, n, dof) to each goal is nearest to a pose (dof,), or to one for each (n, dof), by
     its furthest joint, of those that meet it (k, n) bool; the one of the highest reward (k, n) where none does. (n,)"""
-    away = np.where(met, np.abs(moved(near, q, continuous)).max(-1), np.inf)
+    away = np.where(met, np.abs(moved(near, q, turns)).max(-1), np.inf)
     return np.where(met.any(0), away.argmin(0), reward.argmax(0))
 
 
-def distinct(q: np.ndarray, reward: np.ndarray, continuous: Sequence[bool]) -> list[int]:
+def distinct(q: np.ndarray, reward: np.ndarray, turns: Sequence[bool]) -> list[int]:
     """Which of several poses (k, dof) differ, in the order of their rewards (k,), the highest first."""
     chosen: list[int] = []
     for i in np.argsort(-reward, kind="stable"):
-        if all(np.abs(moved(q[i], q[j], continuous)).max() >= SAME for j in chosen):
+        if all(np.abs(moved(q[i], q[j], turns)).max() >= SAME for j in chosen):
             chosen.append(int(i))
     return chosen

@@ -18,6 +18,9 @@ from arm5dof.envs.paths import Path
 from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
 
+AT_ONCE = 16_384
+"""Goals in one device call: more take memory, and no less time each."""
+
 
 class Policy(struct.PyTreeNode, eq=False):
     """A trained policy for one task. A pytree whose leaves are the networks and the agent's numbers.
@@ -102,21 +105,33 @@ class Policy(struct.PyTreeNode, eq=False):
             UserError: A goal is missing, not finite or of another shape, or the task has no forward model.
         """
         goals, single = self._goals(target, inputs, corrections)
-        turns = self.forward_model.continuous
+        if near is not None and candidates:
+            raise UserError("solve takes near or candidates, not both")
+        n = len(jax.tree.leaves(goals)[0])
+        poses = None if near is None else np.broadcast_to(self._pose("near", near, n), (n, self.env.action_size))
+        if n <= AT_ONCE:
+            answer = self._answer(goals, corrections, poses, candidates)
+            return jax.tree.map(lambda x: x[0], answer) if single else answer
+        parts = []
+        for first in range(0, n, AT_ONCE):
+            # All are of one size, since another would be another program: the last begins again at the first goal.
+            rows = np.arange(first, first + AT_ONCE) % n
+            some = jax.tree.map(lambda x: x[rows], goals)  # noqa: B023
+            parts.append(self._answer(some, corrections, None if poses is None else poses[rows], candidates))
+        return jax.tree.map(lambda *xs: jnp.concatenate(xs)[:n], *parts)
+
+    def _answer(self, goals: Goal, corrections: int, near: np.ndarray | None, candidates: bool) -> Answer:
+        """`solve` for so many goals as fit the memory."""
         if near is not None:
-            if candidates:
-                raise UserError("solve takes near or candidates, not both")
+            turns, stops = self.forward_model.turns, self.forward_model.stops
             found, met = self._candidates(goals, corrections)
-            pose = self._pose("near", near, len(met[0]))
-            which = paths.nearest(np.asarray(found.answer.q), met, np.asarray(found.reward), turns, pose)
+            which = paths.nearest(np.asarray(found.answer.q), met, np.asarray(found.reward), turns, near)
             answer = _pick(found, which)
-            answer = answer._replace(q=jnp.asarray(paths.beside(np.asarray(answer.q), pose, turns)))
-        elif candidates:
+            return answer._replace(q=jnp.asarray(paths.beside(np.asarray(answer.q), near, turns, stops)))
+        if candidates:
             found = _ask(self.forward_model, self, goals, corrections, self.forward_model.branches)
-            answer = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), found.answer)
-        else:
-            answer = _solve(self.forward_model, self, goals, corrections)
-        return jax.tree.map(lambda x: x[0], answer) if single else answer
+            return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), found.answer)
+        return _solve(self.forward_model, self, goals, corrections)
 
     def solve_all(self, *target: Any, corrections: int = 10, **inputs: Any) -> Answer:
         """Every distinct answer of the actor to one goal, the best first.
@@ -136,9 +151,7 @@ class Policy(struct.PyTreeNode, eq=False):
         if not single:
             raise UserError("solve_all takes one goal")
         found = jax.tree.map(lambda x: x[:, 0], self._candidates(goals, corrections)[0])
-        rows = np.array(
-            paths.distinct(np.asarray(found.answer.q), np.asarray(found.reward), self.forward_model.continuous)
-        )
+        rows = np.array(paths.distinct(np.asarray(found.answer.q), np.asarray(found.reward), self.forward_model.turns))
         return jax.tree.map(lambda x: x[rows], found.answer)
 
     def path(self, *target: Any, start: Any = None, corrections: int = 10, **inputs: Any) -> Path:
@@ -173,11 +186,12 @@ class Policy(struct.PyTreeNode, eq=False):
 
     def _path(self, found: Candidate, begin: np.ndarray | None) -> Path:
         """The best line of candidates (k, n)."""
-        turns = self.forward_model.continuous
+        turns, stops = self.forward_model.turns, self.forward_model.stops
         answer = _pick(found, paths.chain(np.asarray(found.answer.q), self._met(found.answer), turns, begin))
-        q = paths.unwound(np.asarray(answer.q), turns)
+        q = np.array(answer.q)
         if begin is not None:
-            q = q + paths.beside(q[0], begin, turns) - q[0]
+            q[0] = paths.beside(q[0], begin, turns, stops)
+        q = paths.unwound(q, turns, stops)
         return Path(jnp.asarray(q), answer.outcome, answer.errors, paths.jumps(q))
 
     def _goals(self, target: tuple[Any, ...], inputs: dict[str, Any], corrections: Any) -> tuple[Goal, bool]:
@@ -237,8 +251,7 @@ class Policy(struct.PyTreeNode, eq=False):
 @partial(jax.jit, static_argnames=("env", "corrections"))
 def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
     """Compiled once for an environment and an agent, whatever the networks."""
-    found = inverse_kinematics.solve(env, policy, goals, corrections)
-    return (inverse_kinematics.nearest(env, policy, goals, found) if corrections else found).answer
+    return inverse_kinematics.solve(env, policy, goals, corrections).answer
 
 
 @partial(jax.jit, static_argnames=("env", "corrections", "branches"))

@@ -14,8 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm5dof.arm import Arm, load_arm
-from arm5dof.arm.settling import settle_steps
-from arm5dof.envs.reach import ReachConfig
 
 ROBOT = """<mujoco>{options}<worldbody><body name="car" pos=".1 .2 .3" quat="1 2 3 4">{base}<geom size=".1"/>
     <body name="upper" pos="0 0 .2"><joint name="a" range="-1 1"/><geom size=".1"/>
@@ -162,7 +160,7 @@ def test_slides_and_wheels_of_a_base_are_held_too():
 
 
 @pytest.mark.parametrize(
-    ("ctrlrange", "turn", "continuous"),
+    ("ctrlrange", "turn", "turns"),
     [
         ("", [-180, 180], True),
         ('ctrllimited="true" ctrlrange="-7 7"', [-180, 180], True),
@@ -170,12 +168,27 @@ def test_slides_and_wheels_of_a_base_are_held_too():
         ('ctrllimited="true" ctrlrange="-1 2"', [np.degrees(-1), np.degrees(2)], False),
     ],
 )
-def test_a_joint_without_limits_is_a_turn(ctrlrange: str, turn: list[float], continuous: bool):
+def test_a_joint_without_limits_is_a_turn(ctrlrange: str, turn: list[float], turns: bool):
     more = f'<actuator><position joint="spin" {ctrlrange}/></actuator>'
     arm = load_arm(robot('<joint name="spin"/>', more=more), "body tip")
     np.testing.assert_allclose(np.degrees([arm.lower[0], arm.upper[0]]), turn, atol=1e-9)
-    assert arm.continuous == (continuous, False, False)
-    assert ("continuous" in repr(arm)) == continuous
+    assert arm.turns == (turns, False, False)
+    assert ("continuous" in repr(arm)) == (not ctrlrange)
+
+
+@pytest.mark.parametrize(
+    ("limits", "turn", "turns"),
+    [
+        ("-361 361", [-180, 180], True),
+        ("-30 400", [-30, 330], True),
+        ("-170 183", [-170, 183], False),
+    ],
+)
+def test_of_more_than_a_turn_one_is_asked_for(limits: str, turn: list[float], turns: bool):
+    arm = load_arm(robot(f'<joint name="spin" range="{limits}"/>'), "body tip")
+    np.testing.assert_allclose(np.degrees([arm.lower[0], arm.upper[0]]), turn, atol=1e-9)
+    assert arm.turns[0] == turns
+    np.testing.assert_allclose(np.degrees(arm.stops[0]), [float(x) for x in limits.split()])
 
 
 # URDF
@@ -196,7 +209,7 @@ def test_urdf(tmp_path: Path):
     links = LINK.format("l1"), LINK.format("l2")
     path.write_text(URDF.format(*links, ""))
     arm = load_arm(path)
-    assert (arm.joint_names, arm.continuous) == (("j1", "j2"), (True, False))
+    assert (arm.joint_names, arm.turns) == (("j1", "j2"), (True, False))
     assert arm.why_site == "chosen: body 'tool0', by its name" and (arm.lower[1], arm.upper[1]) == (-1, 2)
     np.testing.assert_allclose(
         arm.forward(np.array([np.pi / 2, 1.0])), [0, 0.2 * np.sin(1), 0.4 + 0.2 * np.cos(1)], atol=1e-6
@@ -260,18 +273,6 @@ def test_two_servos_on_a_joint_are_refused():
     assert text == "joint 'a' has 2 actuators that hold positions, 'one' and 'actuator_1': keep one"
     damped = '<actuator><position joint="a"/><velocity joint="a"/></actuator>'
     assert load_arm(robot(more=damped), "body tip").actuation == ("position + velocity", "none")
-
-
-def test_servos_that_lag_or_sag_are_told_from_those_that_settle():
-    assert settle_steps(load_arm("arm7.xml")) <= ReachConfig().substeps
-    light = '<option gravity="0 0 0"/>'
-    stiff, soft = (
-        f'<actuator><position joint="a" kp="{kp}" kv="{kv}"/><position joint="b" kp="{kp}" kv="{kv}"/></actuator>'
-        for kp, kv in ((1000, 40), (10, 10))
-    )
-    arms = [robot(more=stiff, options=light), robot(more=soft, options=light), robot(more=stiff), robot(more=soft)]
-    quick, slow, *sagging = (settle_steps(load_arm(arm, "body tip"), 4000) for arm in arms)
-    assert quick < slow / 5 and sagging == [None, None]
 
 
 # Names and units

@@ -38,7 +38,7 @@ def test_a_new_robot_is_told_of(rover: Path, capsys):
         ["lift", "slide", "0.0", "300.0", "mm", "position"],
     ]
     assert rows[3] == "kinematic dynamics: yes"
-    assert rows[4].startswith("servo dynamics: no, joint 'joint_0' has no position actuator (but none)")
+    assert rows[4].startswith("servo dynamics: yes, the servos computed for joint_0 settle in ")
 
 
 def test_json_is_in_radians_and_metres(rover: Path, capsys):
@@ -49,14 +49,19 @@ def test_json_is_in_radians_and_metres(rover: Path, capsys):
     assert told["joints"][1] == lift and told["joints"][0]["lower"] == -np.pi
     assert told["reach_m"] == pytest.approx(np.hypot(0.3, 0.3)) and told["base"]["position_m"] == [0, 0, 0.2]
     assert told["dynamics"]["kinematic"]["works"] and told["dynamics"]["kinematic"]["reason"] is None
-    assert not told["dynamics"]["servo"]["works"] and told["dynamics"]["servo"]["settle_steps"] is None
+    servo = told["dynamics"]["servo"]
+    assert servo["works"] and servo["computed"] == ["joint_0"]
+    assert servo["settle_seconds"] == pytest.approx(0.002 * servo["settle_steps"])
 
 
 def test_the_figure_shows_the_axes_of_the_end_effector(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setenv("MUJOCO_GL", "off")
     path = tmp_path / "arm.png"
     assert cli.main(["arm", "arm7.xml", "--figure", str(path)]) == 0
-    assert "within 1 % of where they are told in 3 physics steps (substeps = 5)" in capsys.readouterr().out
+    assert (
+        "the servos settle in 3 physics steps (0.06 s), which MJX simulates at every transition"
+        in capsys.readouterr().out
+    )
     blue, green, red = np.moveaxis(cv2.imread(str(path)).astype(int), -1, 0)
     for one, *others in ((red, green, blue), (green, red, blue), (blue, red, green)):
         assert ((one > 60) & (one > 3 * np.maximum(*others))).sum() > 100

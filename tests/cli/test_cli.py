@@ -273,12 +273,13 @@ def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
         (
             "implicit.xml",
             '<mujoco><option integrator="implicit"/><worldbody><body><joint name="a" range="-1 1"/><geom size="1"/>'
-            '<site name="ee" pos="1 0 0"/></body></worldbody><actuator><position joint="a"/></actuator></mujoco>',
+            '<site name="ee" pos="1 0 0"/></body></worldbody>'
+            '<actuator><position joint="a" kp="1e8" kv="1e6"/></actuator></mujoco>',
             "MJX cannot simulate this model",
         ),
     ]:
         (tmp_path / name).write_text(text)
-        assert said in fails("train", "--arm", name)
+        assert said in fails("train", "--arm", name, "--servo", "model")
     assert not (tmp_path / "runs").exists()
 
 

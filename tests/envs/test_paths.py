@@ -62,11 +62,27 @@ def test_distinct_answers_stand_for_all(given_poses):
 def test_a_turn_more_is_the_same(q):
     """For a joint without limits, and for it alone."""
     turns = (True, False)
-    line = paths.unwound(q, turns)
+    endless = np.full((2, 2), [-np.inf, np.inf])
+    line = paths.unwound(q, turns, endless)
     assert (np.abs(np.diff(line[:, 0])) <= np.pi + 1e-9).all()
     np.testing.assert_allclose(np.cos(line[:, 0]), np.cos(q[:, 0]), atol=1e-9)
     np.testing.assert_array_equal(line[:, 1], q[:, 1])
     other = q + 2 * np.pi * np.array([3, 0])
     np.testing.assert_allclose(paths.moved(q, other, turns), 0, atol=1e-9)
-    np.testing.assert_allclose(paths.beside(q, other, turns), other, atol=1e-9)
+    np.testing.assert_allclose(paths.beside(q, other, turns, endless), other, atol=1e-9)
     assert paths.distinct(np.stack([q[0], other[0]]), np.array([1.0, 0.0]), turns) == [0]
+
+
+@given(
+    arrays(float, (6, 1), elements=st.integers(-31, 31).map(lambda i: 0.1 * i)),
+    st.floats(3.2, 8.0),
+    st.floats(3.2, 8.0),
+)
+def test_turns_end_at_the_stops(q, below, above):
+    stops, turns = np.array([[-below, above]]), (True,)
+    line = paths.unwound(q, turns, stops)
+    assert (stops[:, 0] <= line).all() and (line <= stops[:, 1]).all()
+    np.testing.assert_allclose(np.cos(line), np.cos(q), atol=1e-9)
+    # It goes the shorter way unless a stop is in it.
+    for a, b, way in zip(line[:-1, 0], line[1:, 0], paths.moved(q[:-1], q[1:], turns)[:, 0], strict=True):
+        assert abs(b - a - way) < 1e-9 or not -below <= a + way <= above

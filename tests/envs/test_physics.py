@@ -23,7 +23,6 @@ MOVING = """
       <site name="ee" pos="0.2 0 0"/>
     </body>
     <body pos="0 0 0.5"><freejoint/><geom size="0.03"/></body>
-    <geom type="plane" size="1 1 0.1"/>
   </worldbody>
   <actuator>
     <position joint="turn" kp="50" timeconst="0.1" ctrlrange="-1 1" ctrllimited="true"/>
@@ -34,7 +33,7 @@ MOVING = """
 
 
 def moving(option: str = "") -> Arm:
-    """An arm whose actuator has a state of its own, and a ball that falls on a floor."""
+    """An arm whose actuator has a state of its own, and a ball that falls."""
     return load_arm(mujoco.MjSpec.from_string(MOVING.replace("{option}", option)))
 
 
@@ -46,7 +45,7 @@ def test_at_rest_is_as_mjx_has_it():
 
 
 def test_nothing_is_lost_between_steps():
-    """Each step leads where it does when all of `mjx.Data` is carried along, through actuator states and contacts."""
+    """Each step leads where it does when all of `mjx.Data` is carried along, through actuator states."""
     arm = moving()
     ctrl = jnp.linspace(-1, 1, 300)
 

@@ -306,13 +306,15 @@ def test_step_keeps_the_state_it_was_given(kinematic: Reach):
 # Other arms
 
 
-def test_an_arm_without_servos_can_only_be_posed():
+def test_an_arm_without_servos_is_posed_or_gets_some():
     spec = serial_arm(3, seed=0)
     spec.delete(list(spec.actuators)[1])
     arm = load_arm(spec)
-    with pytest.raises(UserError, match=r"joint 'joint_1' has no position actuator.*choose dynamics = .kinematic."):
-        Reach(ReachConfig(dynamics="servo"), arm)
+    with pytest.raises(UserError, match=r"joint 'joint_1' has no position actuator.*dynamics = .kinematic."):
+        Reach(ReachConfig(dynamics="servo", servo="model"), arm)
     assert Reach(ReachConfig(dynamics="kinematic"), arm).action_size == 3
+    env = Reach(ReachConfig(dynamics="servo"), arm)
+    assert "servos computed for 'joint_1' (driven by none)" in env.about and (env.arm.actuators >= 0).all()
 
 
 def test_seven_joints_without_a_marker():
