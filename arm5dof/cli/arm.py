@@ -82,11 +82,11 @@ def _settling(arm: Arm) -> dict[str, Any]:
     from arm5dof.arm.computed_servos import with_servos
     from arm5dof.arm.servos import Servos
 
-    steps = Servos(with_servos(arm)).settle_steps
+    servos = Servos(with_servos(arm))
     computed = [name for name, a in zip(arm.joint_names, arm.actuators, strict=True) if a < 0]
     return {
-        "settle_steps": steps,
-        "settle_seconds": None if steps is None else steps * arm.mj_model.opt.timestep,
+        "settle_steps": servos.settle_steps,
+        "rest_seconds": servos.rest_seconds,
         "computed": computed,
     }
 
@@ -96,13 +96,15 @@ def _servos(servo: dict[str, Any]) -> str:
     if not servo["works"]:
         return f"no, {servo['reason']}"
     computed = f" computed for {', '.join(servo['computed'])}" if servo["computed"] else ""
-    steps = servo["settle_steps"]
-    if steps is None:
-        return f"yes, but the servos{computed} do not come to rest: give them damping, or stiffen them"
-    settled = f"yes, the servos{computed} settle in {steps} physics steps ({servo['settle_seconds']:.2f} s)"
-    if steps > servo["substeps"]:
-        return f"{settled}, too many for MJX to simulate at every transition: C MuJoCo measures what was learnt"
-    return f"{settled}, which MJX simulates at every transition"
+    steps, seconds = servo["settle_steps"], servo["rest_seconds"]
+    if steps is not None and steps <= servo["substeps"]:
+        return f"yes, the servos{computed} settle in {steps} physics steps, which MJX simulates at every transition"
+    if seconds is None:
+        return f"yes, but the servos{computed} do not bring the arm to rest: give them damping, or stiffen them"
+    return (
+        f"yes, the servos{computed} bring the arm to rest {seconds:.2f} s after a move, too long to be simulated at "
+        "every transition: C MuJoCo measures what was learnt without"
+    )
 
 
 def _as_json(arm: Arm, dynamics: dict[str, dict[str, Any]]) -> dict[str, Any]:

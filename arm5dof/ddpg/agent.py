@@ -204,10 +204,6 @@ class DDPG:
         """Which of the actor's heads the critic prefers for a batch of observations, (batch,) int32."""
         return self.value(config, critic, obs, self.candidates(actor, obs)).argmax(-1)
 
-    def ranking(self, config: DDPGConfig, actor: Params, critic: Params, obs: Observation) -> jax.Array:
-        """The actor's heads, the critic's favourite first, for a batch of observations, (batch, heads) int32."""
-        return jnp.argsort(self.value(config, critic, obs, self.candidates(actor, obs)), descending=True)
-
     def answer(self, actor: Params, obs: Observation, head: jax.Array) -> jax.Array:
         """The actions of given heads (batch,) for a batch of observations, (batch, action_size)."""
         return _pick(self.candidates(actor, obs), head)

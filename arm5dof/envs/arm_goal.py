@@ -17,7 +17,7 @@ from annotated_types import Ge
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.computed_servos import with_servos
-from arm5dof.arm.servos import MOST_S, Servos
+from arm5dof.arm.servos import Servos
 from arm5dof.envs.base import Act, Goal, Observation, State, Task
 from arm5dof.envs.episodes import corrected, settled
 from arm5dof.envs.inverse_kinematics import solve
@@ -57,7 +57,7 @@ class ArmGoalConfig:
     """How answers are corrected. target: the policy is asked again, for a goal shifted by the error; jacobian: damped
     least squares from the policy's answer, which also finds the nearest that the joint limits allow."""
     branches: Annotated[int, Ge(1)] = static(default=1, may_change=True)
-    """How many of the policy's candidate answers are corrected, its preferred ones first; the best counts."""
+    """How many of the policy's candidate answers are corrected, those that come nearest first; the best counts."""
     restarts: Annotated[int, Ge(0)] = static(default=0, may_change=True)
     """From how many random poses damped least squares starts beside, for goals that no answer came near (jacobian)."""
     refinements: Annotated[int, Ge(0)] = static(default=10, may_change=True)
@@ -111,16 +111,15 @@ class ArmGoalEnv(Task):
             self.arm = with_servos(self.arm)
             self._notes.append(f"servos computed for {names} (driven by {drivers}), critically damped")
         servos = Servos(self.arm)
-        steps = servos.settle_steps
-        if steps is None:
-            self._notes.append(f"the servos do not come to rest in {MOST_S:g} s: expect little of the episode figure")
-        if steps is None or steps > self.config.substeps:
-            self._servos = servos
-        if steps is not None and self._servos:
-            seconds = steps * self.arm.mj_model.opt.timestep
+        if servos.settle_steps is not None and servos.settle_steps <= self.config.substeps:
+            return
+        self._servos = servos
+        if (seconds := servos.rest_seconds) is None:
+            self._notes.append("the servos do not bring the arm to rest: expect little of the episode figure")
+        else:
             self._notes.append(
-                f"the servos settle in {steps} physics steps ({seconds:.2f} s): the policy learns where they settle, "
-                "and the episode figure is measured in C MuJoCo"
+                f"the servos bring the arm to rest {seconds:.2f} s after a move, more than a control step: the policy "
+                "learns where they bring it, and the episode figure is measured in C MuJoCo"
             )
 
     # What a goal is: for each task to say.
@@ -327,7 +326,7 @@ class ArmGoalEnv(Task):
     def evaluate(self, act: Act, key: jax.Array, n: int) -> dict[str, jax.Array]:
         """Errors on `n` unseen goals, (n,) each, of three kinds:
 
-        - `one_shot`: one answer of the policy, by forward kinematics;
+        - `one_shot`: one call of the policy: of its candidate answers the one that forward kinematics finds nearest;
         - `refined`: the same with closed-loop target correction (`solve`);
         - `episode`: the last step of an episode from a random pose, in the environment, corrected in its first steps by
           the error that the arm then shows; with slow servos, in C MuJoCo, the arm at rest after the `refined` answer,

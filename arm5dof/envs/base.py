@@ -54,8 +54,8 @@ class Act(Protocol):
         call, it keeps a motion on one branch of solutions."""
         ...
 
-    def branches(self, obs: Observation) -> jax.Array:
-        """All of its candidate answers, the preferred one first, (n, branches) int32."""
+    def answers(self, obs: Observation) -> jax.Array:
+        """The actions of all its candidate answers, (n, branches, action_size), whichever it prefers."""
         ...
 
 

@@ -94,7 +94,9 @@ def settled(env: ArmGoalEnv, servos: Servos, wanted: jax.Array, state: State, co
         return Settling(state, again, best, jnp.where(better, state.reward, now.reward)), None
 
     correcting = jnp.arange(corrections + 2) <= corrections
-    start = Settling(state, wanted, wanted, jnp.full(len(wanted), -jnp.inf))
+    held = jax.vmap(env.arm.to_ctrl)(state.data.qpos[:, env.arm.qpos])
+    data = state.data.replace(ctrl=state.data.ctrl.at[:, env.arm.actuators].set(held))
+    start = Settling(state.replace(data=data), wanted, wanted, jnp.full(len(wanted), -jnp.inf))
     final, _ = jax.lax.scan(step, start, correcting)
     return _finite(final.state)
 

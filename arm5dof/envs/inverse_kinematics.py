@@ -42,17 +42,19 @@ class Candidate(NamedTuple):
 
 
 def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candidate:
-    """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose: its preferred answer, or
-    with `corrections` > 0 of all `candidates` the one of the highest reward, and where that misses the `nearest`."""
+    """Ask a policy for actions that lead to goals (leading axis n), from the arm's home pose: of its answers the one of
+    the highest reward by the forward model, or with `corrections` > 0 of all `candidates`, and where that misses the
+    `nearest`."""
     if corrections:
         found = candidates(env, act, goals, corrections, env.branches)
         best = found.reward.argmax(0)
         return nearest(env, act, goals, jax.tree.map(lambda x: x[best, jnp.arange(len(best))], found))
-    return _judge(env, goals, act(jax.vmap(env.question)(goals)))
+    actions, order = _ranked(env, act, goals)
+    return _judge(env, goals, actions[jnp.arange(len(order)), order[:, 0]])
 
 
 def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int, branches: int | None = None) -> Candidate:
-    """Several answers to each goal, (candidates, n), the policy's preferred one first.
+    """Several answers to each goal, (candidates, n), first the policy's own that comes nearest.
 
     So many branches as are given, or all, are corrected so often, each for itself. How is for the task to say
     (`env.correction`): "target" asks the policy again, for goals shifted by the error that it was seen to make, with
@@ -75,12 +77,12 @@ def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int, branc
     def descend(action: jax.Array) -> Candidate:
         return judge(jax.vmap(partial(_descend, env, corrections))(action, goals))
 
-    obs = observe(goals)
+    actions, order = _ranked(env, act, goals)
     if env.correction == "target":
         if branches == 1:
-            return jax.tree.map(lambda x: x[None], follow(act.branch(obs)))
-        return jax.lax.map(follow, act.branches(obs)[:, :branches].T)
-    first = jax.lax.map(partial(act, obs), act.branches(obs)[:, :branches].T)
+            return jax.tree.map(lambda x: x[None], follow(order[:, 0]))
+        return jax.lax.map(follow, order[:, :branches].T)
+    first = actions[jnp.arange(len(order)), order[:, :branches].T]
     random = jax.random.uniform(jax.random.key(0), (env.restarts, *first.shape[1:]), minval=-1, maxval=1)
     return jax.lax.map(descend, jnp.concatenate([first, random]))
 
@@ -99,8 +101,7 @@ def nearest(env: ForwardModel, act: Act, goals: Goal, found: Candidate) -> Candi
         i, found = state
         rows = jax.lax.dynamic_slice(order, (i,), (AT_ONCE,))
         asked = jax.tree.map(lambda x: x.at[rows].get(mode="clip"), goals)
-        obs = jax.vmap(env.question)(asked)
-        starts = jax.lax.map(partial(act, obs), act.branches(obs).T)
+        starts = act.answers(jax.vmap(env.question)(asked)).swapaxes(0, 1)
         starts = jnp.concatenate([starts, jnp.broadcast_to(random, (LAST_STARTS, *starts.shape[1:]))])
         descend = partial(_descend, env, LAST_STEPS)
         tried = jax.lax.map(lambda start: _judge(env, asked, jax.vmap(descend)(start, asked)), starts)
@@ -124,6 +125,18 @@ def follow_line(env: ForwardModel, goals: Goal, first: jax.Array) -> Candidate:
 
     actions = jax.lax.scan(step, first, goals)[1].swapaxes(0, 1)
     return jax.lax.map(partial(_judge, env, goals), actions)
+
+
+def _ranked(env: ForwardModel, act: Act, goals: Goal) -> tuple[jax.Array, jax.Array]:
+    """A policy's answers to goals, (n, branches, action_size), and which is the best by the forward model, the second
+    best, ..., (n, branches)."""
+    actions = act.answers(jax.vmap(env.question)(goals))
+
+    def reward(action: jax.Array, goal: Goal) -> jax.Array:
+        return env.goal_reward(env.outcome(action), goal, action)[0]
+
+    found = jax.vmap(jax.vmap(reward, (0, None)))(actions, goals)
+    return actions, jnp.argsort(found, descending=True)
 
 
 def _judge(env: ForwardModel, goals: Goal, action: jax.Array) -> Candidate:

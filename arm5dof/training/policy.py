@@ -67,11 +67,11 @@ class Policy(struct.PyTreeNode, eq=False):
             return self.branch(jax.tree.map(lambda x: jnp.asarray(x)[None], obs))[0]
         return self.agent.head(self.config, self.networks.actor, self.networks.critic, obs)
 
-    def branches(self, obs: Observation) -> jax.Array:
-        """All of the actor's heads, the critic's favourite first, (n, heads) int32, for observations as in a call."""
+    def answers(self, obs: Observation) -> jax.Array:
+        """The actions of all the actor's heads, (n, heads, action_size), for observations as in a call."""
         if _is_single(self.env, obs):
-            return self.branches(jax.tree.map(lambda x: jnp.asarray(x)[None], obs))[0]
-        return self.agent.ranking(self.config, self.networks.actor, self.networks.critic, obs)
+            return self.answers(jax.tree.map(lambda x: jnp.asarray(x)[None], obs))[0]
+        return self.agent.candidates(self.networks.actor, obs)
 
     @property
     def forward_model(self) -> ForwardModel:
@@ -94,7 +94,7 @@ class Policy(struct.PyTreeNode, eq=False):
             near: Joint positions (dof,), or (n, dof), radians (metres for slides): of all the actor's answers that are
                 within the smallest limits of the task's errors (1 mm, 0.5 degrees) the nearest to these counts.
             candidates: Whether to give every candidate answer, as many as the task follows where it corrects, the
-                policy's preferred one first: with an axis (candidates,) after that of the goals. Some may be far off.
+                best one first: with an axis (candidates,) after that of the goals. Some may be far off.
             inputs: The goal inputs by name: `target=...`, and for `reach_pose` `approach=...` (3,) or (n, 3), or
                 `quaternion=...` (4,) or (n, 4), w first.
 

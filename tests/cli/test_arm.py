@@ -38,7 +38,7 @@ def test_a_new_robot_is_told_of(rover: Path, capsys):
         ["lift", "slide", "0.0", "300.0", "mm", "position"],
     ]
     assert rows[3] == "kinematic dynamics: yes"
-    assert rows[4].startswith("servo dynamics: yes, the servos computed for joint_0 settle in ")
+    assert rows[4].startswith("servo dynamics: yes, the servos computed for joint_0 ")
 
 
 def test_json_is_in_radians_and_metres(rover: Path, capsys):
@@ -51,17 +51,14 @@ def test_json_is_in_radians_and_metres(rover: Path, capsys):
     assert told["dynamics"]["kinematic"]["works"] and told["dynamics"]["kinematic"]["reason"] is None
     servo = told["dynamics"]["servo"]
     assert servo["works"] and servo["computed"] == ["joint_0"]
-    assert servo["settle_seconds"] == pytest.approx(0.002 * servo["settle_steps"])
+    assert servo["rest_seconds"] < 5
 
 
 def test_the_figure_shows_the_axes_of_the_end_effector(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setenv("MUJOCO_GL", "off")
     path = tmp_path / "arm.png"
     assert cli.main(["arm", "arm7.xml", "--figure", str(path)]) == 0
-    assert (
-        "the servos settle in 3 physics steps (0.06 s), which MJX simulates at every transition"
-        in capsys.readouterr().out
-    )
+    assert "the servos settle in 3 physics steps, which MJX simulates at every transition" in capsys.readouterr().out
     blue, green, red = np.moveaxis(cv2.imread(str(path)).astype(int), -1, 0)
     for one, *others in ((red, green, blue), (green, red, blue), (blue, red, green)):
         assert ((one > 60) & (one > 3 * np.maximum(*others))).sum() > 100

@@ -12,7 +12,7 @@ from helpers.errors import said
 from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG, DDPGConfig
 from arm5dof.envs import State, Task
-from arm5dof.envs.inverse_kinematics import solve
+from arm5dof.envs.inverse_kinematics import candidates, solve
 from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
 from arm5dof.grasp.shipped import shipped
@@ -143,15 +143,28 @@ def test_a_policy_takes_one_observation_or_many(policy: Policy):
     np.testing.assert_array_equal(act(jax.tree.map(np.asarray, obs)), actions)
 
 
-def test_branches_are_the_heads_in_the_critics_order(policy: Policy):
+def test_answers_are_those_of_all_heads(policy: Policy):
     obs = jax.jit(jax.vmap(policy.env.reset))(jax.random.split(jax.random.key(1), 7)).obs
-    branches = policy.branches(obs)
-    np.testing.assert_array_equal(np.sort(branches, axis=1), np.tile(np.arange(3), (7, 1)))
-    np.testing.assert_array_equal(branches[:, 0], policy.branch(obs))
-    agent, config, networks = policy.agent, policy.config, policy.networks
-    value = agent.value(config, networks.critic, obs, agent.candidates(networks.actor, obs))
-    assert (np.diff(np.take_along_axis(np.asarray(value), np.asarray(branches), 1)) <= 0).all()
-    np.testing.assert_array_equal(policy.branches(jax.tree.map(lambda x: x[3], obs)), branches[3])
+    answers = policy.answers(obs)
+    assert answers.shape == (7, 3, 5)
+    for head in range(3):
+        np.testing.assert_allclose(answers[:, head], policy(obs, jnp.full(7, head)), atol=1e-6)
+    np.testing.assert_allclose(policy.answers(jax.tree.map(lambda x: x[3], obs)), answers[3], atol=1e-6)
+
+
+def test_the_forward_model_chooses_among_the_answers(policy: Policy):
+    """The one that plain C MuJoCo finds nearest to the goal."""
+    arm, goals = policy.env.arm, jax.vmap(policy.env.sample_goal)(jax.random.split(jax.random.key(4), 50))
+    answers = np.asarray(policy.answers(jax.vmap(policy.env.question)(goals)))
+    data, nearest = mujoco.MjData(arm.mj_model), []
+    for actions, goal in zip(answers, goals, strict=True):
+        away = []
+        for action in actions:
+            data.qpos[arm.qpos] = arm.to_joints(action)
+            mujoco.mj_kinematics(arm.mj_model, data)
+            away.append(np.linalg.norm(data.site_xpos[arm.site] - goal))
+        nearest.append(min(away))
+    np.testing.assert_allclose(policy.solve(goals).errors["distance"], nearest, atol=1e-6)
 
 
 @pytest.mark.parametrize("followed", [2, 3])
@@ -160,21 +173,27 @@ def test_corrections_follow_several_branches(arm: Arm, followed: int):
     env = Reach(ReachConfig(dynamics="kinematic", branches=followed), arm)
     policy, single = untrained(env), Reach(ReachConfig(dynamics="kinematic"), arm)
     goals = jax.vmap(env.sample_goal)(jax.random.split(jax.random.key(4), 50))
-    order = policy.branches(jax.vmap(env.question)(goals))
+    answers = policy.answers(jax.vmap(env.question)(goals))
+    away = jax.vmap(jax.vmap(lambda a, goal: -env.goal_reward(env.outcome(a), goal, a)[0], (0, None)))(answers, goals)
+    order = np.argsort(away, axis=1)
 
     class Alone:
+        """A policy of one head."""
+
         def __init__(self, rank: int) -> None:
             self.rank = rank
 
         def __call__(self, obs, branch=None):
-            return policy(obs, branch)
+            return policy(obs, order[:, self.rank])
 
-        def branch(self, obs):
-            return order[:, self.rank]
+        def answers(self, obs):
+            return policy(obs, order[:, self.rank])[:, None]
 
-    errors = np.stack([solve(single, Alone(rank), goals, 3).answer.errors["distance"] for rank in range(followed)])
-    found = solve(env, policy, goals, 3).answer
-    np.testing.assert_allclose(found.errors["distance"], errors.min(0), atol=1e-6)
+    alone = lambda rank: candidates(single, Alone(rank), goals, 3, 1).answer.errors["distance"][0]
+    errors = np.stack([alone(rank) for rank in range(followed)])
+    found = jax.tree.map(lambda x: x[0], candidates(env, policy, goals, 3, followed).answer)
+    best = candidates(env, policy, goals, 3, followed).answer.errors["distance"]
+    np.testing.assert_allclose(best, errors, atol=1e-6)
     assert (errors.argmin(0) > 0).any()
     every = policy.solve(np.asarray(goals), corrections=3, candidates=True)
     assert every.q.shape == (50, followed, 5)
