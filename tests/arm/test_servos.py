@@ -128,8 +128,8 @@ def test_physics_that_blows_up_is_not_finite(tmp_path: Path, monkeypatch, capfd)
 def test_a_computed_servo_is_critically_damped():
     """One joint with a load: q(t) = 1 - (1 + w t) exp(-w t)."""
     xml = """<mujoco><compiler angle="radian"/><option gravity="0 0 0" timestep="5e-4"/>
-      <worldbody><body><joint name="a" axis="0 1 0" range="-2 2"/><geom size=".05" pos=".3 0 0"/><site name="ee" pos=".2 0 0"/></body>
-      </worldbody></mujoco>"""
+      <worldbody><body><joint name="a" axis="0 1 0" range="-2 2"/><geom size=".05" pos=".3 0 0"/>
+      <site name="ee" pos=".2 0 0"/></body></worldbody></mujoco>"""
     arm = with_servos(load_arm(mujoco.MjSpec.from_string(xml)))
     model, data = arm.mj_model, mujoco.MjData(arm.mj_model)
     kp, kv = -model.actuator_biasprm[0, 1:3]
