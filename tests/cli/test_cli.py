@@ -494,10 +494,7 @@ def test_interrupt_is_no_traceback(tmp_path):
         "--out",
         str(tmp_path / "run"),
     ]
-    # Where the tests run in the background, Ctrl-C is ignored, and a child would inherit that.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)
-    signal.signal(signal.SIGINT, before)
     metrics = tmp_path / "run" / "metrics.csv"
     while not (metrics.exists() and metrics.stat().st_size):  # The first epoch is over, so nothing compiles any more.
         assert process.poll() is None

@@ -336,12 +336,9 @@ def test_ctrl_c_finishes_the_files(what, status, model, tmp_path):
     long = write_video(tmp_path / "long.mp4", greys(4000))
     command = [sys.executable, "-m", "arm5dof"] if what == "video" else [sys.executable, "-c", CAMERA, str(long)]
     words = ["vision", "detect", long if what == "video" else 0, "--detector", model, "--out", tmp_path / "found"]
-    # Where the tests run in the background, Ctrl-C is ignored, and a child would inherit that.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         [*command, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
     )
-    signal.signal(signal.SIGINT, before)
     while not any(file.stat().st_size for file in tmp_path.glob(".found-*/detections.json")):
         assert process.poll() is None
         time.sleep(0.02)
