@@ -24,6 +24,8 @@ SPEED = 2.0
 force, where simulated ones lose their damping: light joints then spin or tremble for ever."""
 MOST_S = 5.0
 """Seconds after a command's move after which an arm counts as it is, at rest or not."""
+LOST = 1e3
+"""Radians (metres): where a joint is farther away than that, the physics has blown up."""
 MOVES, SHARE, TOLERANCE = 10, 0.8, 0.01
 
 
@@ -108,7 +110,7 @@ class Servos:
     @cached_property
     def rest_seconds(self) -> float | None:
         """Seconds from the end of a command's move, at `SPEED` from one random pose to another, until the arm is at
-        rest, for eight of ten; None if it does not come to rest."""
+        rest, for eight of ten; None if it does not come to rest, NaN if its physics blows up in more than two."""
         states, was, told = self._moves()
         ramp, done, ends = self._ramp(was, told), 0, np.full(MOVES, np.inf)
         with _without_warnings():
@@ -116,7 +118,10 @@ class Servos:
                 states, still = self._advance(states, was, told, ramp, done)
                 done += CHUNK
                 ends = np.where(still & np.isinf(ends), np.maximum(done - ramp, 0) * self.model.opt.timestep, ends)
-        ends[~np.isfinite(states).all(-1)] = np.inf
+        blown_up = ~np.isfinite(states).all(-1)
+        if blown_up.sum() > (1 - SHARE) * MOVES:
+            return float("nan")
+        ends[blown_up] = np.inf
         worst = float(np.sort(ends)[int(SHARE * MOVES) - 1])
         return worst if np.isfinite(worst) else None
 
@@ -144,6 +149,7 @@ class Servos:
         """The states (n, size) some steps later, when so many are done, and which arms are at rest then."""
         share = np.minimum((done + 1 + np.arange(CHUNK)) / np.maximum(ramp, 1)[:, None], 1)[..., None]
         after = self._follow(states, before[:, None] + share * (told - before)[:, None])[:, -1]
+        after[~(np.abs(after[:, self._qpos][:, self.arm.qpos]) < LOST).all(-1)] = np.nan
         return after, self._still(states, after) & (done + CHUNK > ramp + CHUNK)
 
     def _follow(self, states: np.ndarray, control: np.ndarray) -> np.ndarray:

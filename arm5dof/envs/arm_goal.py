@@ -6,6 +6,7 @@ A task says what a goal is (`forward`, `encode`, `decode`), how far one is from 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -116,6 +117,11 @@ class ArmGoalEnv(Task):
         self._servos = servos
         if (seconds := servos.rest_seconds) is None:
             self._notes.append("the servos do not bring the arm to rest: expect little of the episode figure")
+        elif math.isnan(seconds):
+            raise UserError(
+                f"the physics of the servos blows up at its time step of {self.arm.mj_model.opt.timestep:g} s: "
+                'choose a smaller <option timestep="..."/>, weaker servos, or dynamics = "kinematic"'
+            )
         else:
             self._notes.append(
                 f"the servos bring the arm to rest {seconds:.2f} s after a move, more than a control step: the policy "

@@ -125,13 +125,17 @@ class Policy(struct.PyTreeNode, eq=False):
         if near is not None:
             turns, stops = self.forward_model.turns, self.forward_model.stops
             found, met = self._candidates(goals, corrections)
+            if corrections and not met.any(0).all():
+                best = jax.tree.map(lambda x: x[None], _solve(self.forward_model, self, goals, corrections))
+                found = jax.tree.map(lambda *parts: jnp.concatenate(parts), found, best)
+                met = self._met(found.answer)
             which = paths.nearest(np.asarray(found.answer.q), met, np.asarray(found.reward), turns, near)
             answer = _pick(found, which)
             return answer._replace(q=jnp.asarray(paths.beside(np.asarray(answer.q), near, turns, stops)))
         if candidates:
             found = _ask(self.forward_model, self, goals, corrections, self.forward_model.branches)
             return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), found.answer)
-        return _solve(self.forward_model, self, goals, corrections)
+        return _solve(self.forward_model, self, goals, corrections).answer
 
     def solve_all(self, *target: Any, corrections: int = 10, **inputs: Any) -> Answer:
         """Every distinct answer of the actor to one goal, the best first.
@@ -249,9 +253,9 @@ class Policy(struct.PyTreeNode, eq=False):
 
 
 @partial(jax.jit, static_argnames=("env", "corrections"))
-def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Answer:
+def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Candidate:
     """Compiled once for an environment and an agent, whatever the networks."""
-    return inverse_kinematics.solve(env, policy, goals, corrections).answer
+    return inverse_kinematics.solve(env, policy, goals, corrections)
 
 
 @partial(jax.jit, static_argnames=("env", "corrections", "branches"))

@@ -93,7 +93,7 @@ def test_eval_json_has_exactly_these_keys_and_repeats_itself(trained, capsys):
         assert list(accuracy["within"]) == ["1", "5", "10", "20"]
         shares = list(accuracy["within"].values())
         assert shares == sorted(shares) and shares[0] >= 0 and shares[-1] <= 100
-        assert 0 < accuracy["median_mm"] <= accuracy["p95_mm"]
+        assert 0 <= accuracy["median_mm"] <= accuracy["p95_mm"]
     assert evaluate(1) == found != evaluate(2)
 
 
@@ -132,7 +132,7 @@ def test_solve_gives_every_answer_and_the_nearest(trained, capsys):
     assert len(every) > 1
     assert run(*target) == 0
     (best,) = json.loads(capsys.readouterr().out)
-    # None is within a millimetre, so that the best counts wherever the joints are.
+    # None of the actor's is within a millimetre, so that the best counts wherever the joints are.
     assert run(*target, "--near", *every[0]) == 0
     (near,) = json.loads(capsys.readouterr().out)
     assert near["error_mm"] <= best["error_mm"] + 1e-3
@@ -272,10 +272,10 @@ def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
         ),
         (
             "implicit.xml",
-            '<mujoco><option integrator="implicit"/><worldbody><body><joint name="a" range="-1 1"/><geom size="1"/>'
-            '<site name="ee" pos="1 0 0"/></body></worldbody>'
+            '<mujoco><option integrator="implicit" timestep="0.1"/><worldbody><body><joint name="a" range="-1 1"/>'
+            '<geom size="1"/><site name="ee" pos="1 0 0"/></body></worldbody>'
             '<actuator><position joint="a" kp="1e8" kv="1e6"/></actuator></mujoco>',
-            "MJX cannot simulate this model",
+            "the physics of the servos blows up at its time step of 0.1 s",
         ),
     ]:
         (tmp_path / name).write_text(text)

@@ -69,7 +69,7 @@ def test_fingers_may_close_as_their_positions_grow():
         (lambda: hand(1, -1, joint='range="0 1"'), "each on a slide with a range"),
         (lambda: hand(1, 1), "do not slide in opposite directions"),
         (lambda: hand(1, -1, servoed=1), "finger 'finger 1' has no position actuator"),
-        (lambda: load_arm("arm7.xml").mj_model, "no site, body or geom 'grasp'"),
+        (lambda: load_arm("arm7.xml").mj_model, "no site 'grasp'"),
     ],
 )
 def test_what_is_no_gripper_is_refused(model, words):
