@@ -22,7 +22,7 @@ GOALS = {"95.5 % within 10 mm after, s": ("10", 95.5), "99.9 % within 5 mm after
 
 
 def measure(envs: int, length: int) -> dict[str, float | str]:
-    """Control steps per second with learning on and off, and seconds of training, once compiled, to each of the goals."""
+    """Control steps per second with learning on and off, and seconds of training, once compiled, to each goal."""
     import jax
 
     from arm5dof import load_config
