@@ -17,12 +17,12 @@ import time
 from pathlib import Path
 
 RESULTS = Path(__file__).parent / "results"
-ENVS = [4096, 8192, 16384, 32768, 65536]
-GOALS = {"95.5 % within 10 mm": ("10", 95.5), "99.9 % within 5 mm": ("5", 99.9)}
+ENVS = [4096, 16384, 65536]
+GOALS = {"95.5 % within 10 mm after, s": ("10", 95.5), "99.9 % within 5 mm after, s": ("5", 99.9)}
 
 
 def measure(envs: int, length: int) -> dict[str, float | str]:
-    """Control steps per second with learning on and off, and seconds after compilation to each of the goals."""
+    """Control steps per second with learning on and off, and seconds of training, once compiled, to each goal."""
     import jax
 
     from arm5dof import load_config
@@ -36,9 +36,8 @@ def measure(envs: int, length: int) -> dict[str, float | str]:
     collect = jax.jit(collect, donate_argnums=0)
 
     trainer.start()
-    start = time.perf_counter()
     trainer.advance()  # Compiles.
-    found: dict[str, float | str] = {"compilation, s": time.perf_counter() - start}
+    found: dict[str, float | str] = {}
     evaluate.evaluate(trainer.policy(), 10_000)
     trainer.start()
     seconds = 0.0

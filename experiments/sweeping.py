@@ -3,6 +3,7 @@
     python experiments/sweeping.py speed          16 members of kinematic.toml against 16 runs, one after the other
     python experiments/sweeping.py kills          the driver killed at five random moments, and the table compared
     python experiments/sweeping.py many           1,000 members of a small program: seconds a member, memory
+    python experiments/sweeping.py gpu            64 members of kinematic.toml on one GPU against one
     python experiments/sweeping.py speed --tiny   the same with a budget of a minute, to try this script
 
 Everything is left in runs/sweeping/, and what was found in results/sweeping_WHAT.md, but for --tiny.
@@ -37,7 +38,7 @@ COMMAND = [sys.executable, "-m", "arm5dof"]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "kills", "many"))
+    parser.add_argument("what", choices=("speed", "kills", "many", "gpu"))
     parser.add_argument("--tiny", action="store_true")
     arguments = parser.parse_args()
     shutil.rmtree(OUT / arguments.what, ignore_errors=True)
@@ -46,11 +47,10 @@ def main() -> None:
         "speed": ("A sweep of 16 members beside 16 runs", speed),
         "kills": ("A sweep that was killed five times", kills),
         "many": ("A thousand members of a small program", many),
+        "gpu": ("A sweep of 64 members on one GPU beside one of a single member", gpu),
     }[arguments.what]
     found = measure(OUT / arguments.what, arguments.tiny)
-    command = (
-        f"Command: `python experiments/sweeping.py {arguments.what}`. {platform.machine()} CPU, {xla.cores()} cores."
-    )
+    command = f"Command: `python experiments/sweeping.py {arguments.what}`. {machine(arguments.what)}."
     print(found)
     if not arguments.tiny:
         files.write_text(RESULTS / f"sweeping_{arguments.what}.md", f"# {title}\n\n{command}\n\n{found}\n")
@@ -133,6 +133,29 @@ def many(out: Path, tiny: bool) -> str:
             print(lines[-1])
     rows, took = len(Sweep.open(out / "sweep").table), time.monotonic() - started
     return "\n".join([*lines, "", f"One table of {rows} rows, after {took:.0f} s."])
+
+
+def gpu(out: Path, tiny: bool) -> str:
+    """Wall time of a sweep of 64 members and of one of a single member, each with its compilation and evaluations."""
+    settings, seeds = (TINY, 2) if tiny else ({}, 16)
+    lines = ["| members | s | within 10 mm, one answer: median, least |", "| ---: | ---: | --- |"]
+    took = []
+    for name, axes in (("one", {"seed": [0]}), ("many", {"actor_lr": list(RATES), "seed": {"count": seeds}})):
+        started = time.monotonic()
+        subprocess.run(sweep_command(out / name, axes, settings), check=True)
+        took.append(time.monotonic() - started)
+        runs = Sweep.open(out / name / "sweep").runs.values()
+        within = sorted(run.evaluations[-1]["one_shot"]["within"]["10"] for run in runs)
+        lines.append(f"| {len(runs)} | {took[-1]:.0f} | {within[len(within) // 2]:.2f} %, {within[0]:.2f} % |")
+    return "\n".join([*lines, "", f"All together take **{took[1] / took[0]:.2f}** times one."])
+
+
+def machine(what: str) -> str:
+    """Where it was measured."""
+    if what == "gpu":
+        asked = "import jax; print(jax.devices()[0].device_kind, 'jax', jax.__version__)"
+        return subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True).stdout.strip()
+    return f"{platform.machine()} CPU, {xla.cores()} cores"
 
 
 def sweep_command(out: Path, axes: dict, settings: dict) -> list[str]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +25,9 @@ from arm5dof.training.loggers import Log, Logger, logging, make_loggers
 from arm5dof.training.policy import Policy
 from arm5dof.training.run import Run
 from arm5dof.training.trainer import Counters, Trainer
+
+SAVE_EVERY_S = 60.0
+"""Seconds between checkpoints on the way: those of many members take longer than a GPU takes to train them on."""
 
 
 class Population:
@@ -65,9 +68,10 @@ class Population:
         """Measure each policy."""
         return evaluate_together(self.policies(), targets, [s.train.seed for s in self.settings])
 
-    def member(self, number: int) -> Training:
-        """The state of one training."""
-        return jax.tree.map(lambda x: x[number], self.state)
+    def members(self) -> Iterator[Training]:
+        """The states of all, one after the other, brought from the device at once."""
+        state = jax.device_get(self.state)
+        return (jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(self.settings)))
 
     @property
     def counters(self) -> Counters:
@@ -159,7 +163,7 @@ def _train_on(
 ) -> None:
     """Train to the end, or until nobody is alive. `offset` makes seconds of training of the clock."""
     program, settings = population.program, population.settings[0]
-    budget = settings.train
+    budget, saved = settings.train, time.monotonic()
     while alive:
         at = population.counters
         finished = at.steps >= program.total_steps
@@ -184,6 +188,10 @@ def _train_on(
                 continue
             member.rows.append(trainer.row(at, seconds, metrics[number]))
             logs[number].epoch(member.rows[-1])
-            if program.due(at, budget.checkpoint_every) or at.steps >= program.total_steps:
-                curves.write_rows(member.run.folder, member.rows)
-                member.checkpoints.save(population.member(number))
+        finished = at.steps >= program.total_steps
+        if finished or (program.due(at, budget.checkpoint_every) and time.monotonic() > saved + SAVE_EVERY_S):
+            for number, state in enumerate(population.members()):
+                if number in alive:
+                    curves.write_rows(alive[number].run.folder, alive[number].rows)
+                    alive[number].checkpoints.save(state)
+            saved = time.monotonic()
