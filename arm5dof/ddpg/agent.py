@@ -71,6 +71,9 @@ class DDPGConfig:
     """An error of the critic at a target value v counts 1 / (1 + critic_error_weight |v|) times; 1 / units of reward.
     Where rewards are minus a distance the actor learns the last millimetres from values near a goal. 0: all count
     alike."""
+    limit_weight: Annotated[float, Ge(0)] = 0.0
+    """What an action near its limits, -1 or 1, costs the actor, in units of reward: so much at the limit, and nothing
+    inside `losses.FREE`. Where several actions are as good, those in the middle are learnt."""
     critic_input: Literal["outcome", "state"] = static(default="state")
     """state: the critic sees the observation and the action; outcome: it sees where the action leads by the task's
     forward model, as the paper's does."""
@@ -308,8 +311,10 @@ class DDPG:
             return losses.critic_loss(q, target, batch.weight, config.critic_error_weight), q.mean()
 
         def actor_loss(actor: Params) -> jax.Array:
-            q = self.value(config, critic, batch.obs, self.candidates(actor, batch.obs))
-            return losses.actor_loss(q, batch.weight, config.head_temperature)
+            actions = self.candidates(actor, batch.obs)
+            q = self.value(config, critic, batch.obs, actions)
+            cost = config.limit_weight * losses.limit_cost(actions)
+            return losses.actor_loss(q, batch.weight, config.head_temperature, cost)
 
         rate = config.final_lr + (1 - config.final_lr) * (1 + jnp.cos(jnp.pi * self._progress(training))) / 2
         (loss, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(networks.critic)

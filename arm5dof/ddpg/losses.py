@@ -15,14 +15,26 @@ def critic_loss(q: jax.Array, target: jax.Array, weight: jax.Array, focus: jax.A
     return _mean((target - q) ** 2 / (1 + focus * jnp.abs(target)), weight)
 
 
-def actor_loss(q: jax.Array, weight: jax.Array, temperature: jax.Array | float) -> jax.Array:
+FREE = 0.9
+"""Actions closer to zero cost nothing."""
+
+
+def actor_loss(
+    q: jax.Array, weight: jax.Array, temperature: jax.Array | float, cost: jax.Array | float = 0.0
+) -> jax.Array:
     """Eq. 5: minus the critic's opinion of the actor's actions; its gradient is grad_a Q grad_theta mu.
 
     `q` is (batch, heads). Each sample teaches its heads in proportion to softmax(Q / temperature), so that heads
-    divide the targets among them. With one head this is the paper's loss.
+    divide the targets among them. With one head this is the paper's loss, and `cost` is what actions cost besides.
     """
     share = jax.lax.stop_gradient(jax.nn.softmax(q / temperature, axis=-1))
-    return -_mean((share * q).sum(-1), weight)
+    return -_mean((share * (q - cost)).sum(-1), weight)
+
+
+def limit_cost(action: jax.Array) -> jax.Array:
+    """Sum of squares of how far the components of an action (..., size) lie from `FREE` on towards a limit: 1 for each
+    that is at it."""
+    return (jnp.maximum(jnp.abs(action) - FREE, 0) ** 2).sum(-1) / (1 - FREE) ** 2
 
 
 def _mean(values: jax.Array, weight: jax.Array) -> jax.Array:
