@@ -1,11 +1,11 @@
-"""Public arms as their makers' MJCF has them, each trained by the command that ships: accuracy in both dynamics, time.
+"""Public arms as their makers' MJCF has them, trained by the command that ships: accuracy in both dynamics, and time.
 
-    python experiments/gallery.py --models DIR [DIR ...]     every arm that is found: results/gallery.md, docs/gallery.png
+    python experiments/gallery.py --models DIR [DIR ...]             all: results/gallery.md, docs/gallery.png
     python experiments/gallery.py --models DIR --only ur5e panda     some of them; nothing is written
 
-A DIR is a checkout of MuJoCo Menagerie, or any folder laid out like it. Without --models the arms come from Menagerie as
-the package robot_descriptions has it, if that is installed (it clones from GitHub). An arm that is not found is skipped.
-The runs are left in runs/gallery/; one that is there already is measured, not trained anew.
+A DIR is a checkout of MuJoCo Menagerie, or a folder laid out like it. Without --models the arms come from Menagerie as
+the package robot_descriptions has it (it clones from GitHub), if that is installed. What is not found is skipped. The
+runs are left in runs/gallery/; one that is there already is measured, not trained anew.
 """
 
 from __future__ import annotations
@@ -175,9 +175,9 @@ def markdown(rows: list[list[str]]) -> str:
     lines = [
         "# Public arms, unedited, with the command that ships",
         "",
-        f"Command: `python experiments/gallery.py --models DIR`. {platform.machine()} CPU, {xla.cores()} cores. Each was",
-        "trained by `arm5dof train --arm FILE`: 400 episodes, one seed, 10,000 unseen targets. Near a limit: answers with",
-        "a joint within 2 % of its range of a limit, corrected, and in brackets uniform poses.",
+        f"Command: `python experiments/gallery.py --models DIR`. {platform.machine()} CPU, {xla.cores()} cores. Each",
+        "was trained by `arm5dof train --arm FILE`: 400 episodes, one seed, 10,000 unseen targets. Near a limit:",
+        "corrected answers with a joint within 2 % of its range of a limit, and in brackets uniform poses.",
         "",
         "| " + " | ".join(header) + " |",
         "| --- |" + " ---: |" * (len(header) - 1),

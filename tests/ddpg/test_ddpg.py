@@ -227,6 +227,14 @@ def test_heads_share_a_target_by_softmax():
     np.testing.assert_allclose(gradient, -share / 50, atol=1e-6)
 
 
+def test_actions_cost_at_their_limits_alone():
+    actions = jnp.array([[0.0, 0.9, -0.5], [0.95, 0.0, 0.0], [1.0, -1.0, 0.3]])
+    np.testing.assert_allclose(losses.limit_cost(actions), [0.0, 0.25, 2.0], atol=1e-6)
+    q = np.random.default_rng(0).normal(size=(3, 1))
+    loss = losses.actor_loss(jnp.array(q), jnp.ones(3), 0.01, 0.1 * losses.limit_cost(actions[:, None]))
+    assert loss == pytest.approx(-np.mean(q[:, 0] - 0.1 * np.array([0.0, 0.25, 2.0])), rel=1e-5)
+
+
 def test_losses_without_anything_to_learn_from_are_zero():
     assert losses.critic_loss(jnp.ones(3), jnp.zeros(3), jnp.zeros(3)) == 0
     assert losses.actor_loss(jnp.ones((3, 2)), jnp.zeros(3), 0.01) == 0
@@ -334,6 +342,23 @@ def test_actor_ascends_eq_5(bench: Bench):
     share = np.exp(q / 0.5) / np.exp(q / 0.5).sum(1, keepdims=True)
     expected = -np.einsum("i,ih,iha,ihap->p", weight, share, q_slope, mu_slope) / weight.sum()
     np.testing.assert_allclose(gradient_used(after.actor_optimizer), expected, rtol=1e-3, atol=1e-6)
+    assert np.abs(expected).max() > 1e-3
+
+
+def test_the_actor_leaves_its_limits(bench: Bench):
+    """The gradient that `limit_weight` adds to Eq. 5 is that of the cost, weighted by the heads' shares."""
+    weight, obs, actor = np.asarray(bench.batch.weight), bench.batch.obs, bench.training.networks.actor
+    (without, _), (after, _) = bench.update(limit_weight=0.0), bench.update(limit_weight=0.5)
+    mu = lambda actor: bench.agent.actor.apply(actor, obs["state"])
+    privileged = jnp.repeat(obs["privileged_state"][:, None], bench.config.heads, axis=1)
+    q = np.asarray(q_of(bench, after.networks.critic, privileged, mu(actor)))
+    share = np.exp(q / 0.5) / np.exp(q / 0.5).sum(1, keepdims=True)
+    action = np.asarray(mu(actor))
+    slope = 2 * np.maximum(np.abs(action) - 0.9, 0) * np.sign(action) / 0.01
+    mu_slope = flat_rows(jax.jacobian(mu)(actor), 3)
+    expected = 0.5 * np.einsum("i,ih,iha,ihap->p", weight, share, slope, mu_slope) / weight.sum()
+    found = gradient_used(after.actor_optimizer) - gradient_used(without.actor_optimizer)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
     assert np.abs(expected).max() > 1e-3
 
 
@@ -747,6 +772,17 @@ def test_the_papers_arm_learns(paper_arm: Learnt):
     assert before.min() > 0.1
     assert (after < before / 4).all(), (before, after)
     assert (paper_arm.metrics["nonfinite"] == 0).all()
+
+
+def test_answers_keep_away_from_limits(paper_arm: Learnt):
+    """The last joint moves the end effector hardly at all: nothing but its limits says where it is to be."""
+    env, agent, config = paper_arm.env, paper_arm.agent, paper_arm.config
+    poses = env.arm.sample(jax.random.key(98), (1000,))
+    obs = jax.vmap(env.replace_goal, (None, 0))(member(member(paper_arm.after.env.obs, 0), 0), env.arm.forward(poses))
+    near = lambda action: 100 * np.asarray(jnp.abs(action) > 0.96).any(-1).mean()
+    act = quick_jit(lambda networks: agent.act(config, networks.actor, networks.critic, obs)[0])
+    shares = [near(act(member(paper_arm.after.networks, seed))) for seed in range(3)]
+    assert max(shares) < near(jax.vmap(env.arm.to_action)(poses)), shares
 
 
 def test_seven_joints_learn_with_the_same_code():
