@@ -118,7 +118,6 @@ def measure(public: Public, folder: Path) -> list[str]:
     poses = arm.sample(jax.random.key(0), (SAMPLES,))
     goals = np.asarray(jax.vmap(arm.forward)(poses))
     answer = policy.solve(goals, corrections=10)
-    at_limit = [near_limit(arm, np.asarray(q)) for q in (poses, answer.q)]
     apart = np.abs(np.linalg.norm(reached(arm, np.asarray(answer.q)) - goals, axis=1) - answer.errors["distance"])
     within = lambda kind, limit: f"{last[kind]['within'][limit]:.2f} %"
     return [
@@ -127,7 +126,7 @@ def measure(public: Public, folder: Path) -> list[str]:
         f"{last['one_shot']['median_mm']:.2f} mm, {within('one_shot', '10')}",
         within("refined", "1"),
         f"{within('episode', '5')}, {within('episode', '1')}",
-        f"{at_limit[1]:.0f} % ({at_limit[0]:.0f} %)",
+        f"{near_limit(arm, np.asarray(answer.q)):.0f} % ({near_limit(arm, np.asarray(poses)):.0f} %)",
         f"{1e3 * apart.max():.3f} mm",
         f"{took['seconds'] / 60:.1f} min",
     ]

@@ -54,9 +54,8 @@ def ours(policy: Policy) -> list[list[str]]:
     """One answer of the policy, and corrected ones."""
     goals, rows = targets(policy.env.arm, MILLION), []
     for label, corrections in (("one answer", 0), ("corrected", 10)):
-        solve = lambda n, corrections=corrections: jax.block_until_ready(
-            policy.solve(goals[:n], corrections=corrections)
-        )
+        ask = partial(policy.solve, corrections=corrections)
+        solve = lambda n, ask=ask: jax.block_until_ready(ask(goals[:n]))
         met = np.asarray(solve(BATCHES[-1]).errors["distance"]) <= CLOSE
         speeds = []
         for n in (*BATCHES, MILLION):

@@ -22,13 +22,16 @@ from arm5dof.arm.servos import Servos
 from arm5dof.envs.base import Act, Goal, Observation, State, Task
 from arm5dof.envs.episodes import corrected, settled
 from arm5dof.envs.inverse_kinematics import solve
-from arm5dof.envs.metrics import Error
+from arm5dof.envs.metrics import Error, Share
 from arm5dof.envs.physics import Physics
 from arm5dof.errors import UserError
 from arm5dof.settings import settings, static
 
 PROBES = 500
 """Goals by which a policy is watched while it learns."""
+NEAR_LIMIT = 0.02
+"""Share of a joint's range."""
+AT_LIMIT = Share(f"refined with a joint within {NEAR_LIMIT:.0%} of a limit", higher_is_better=False)
 
 
 @settings
@@ -339,7 +342,8 @@ class ArmGoalEnv(Task):
           which is told again as often with what the joints lack. Infinite where physics blew up.
 
         By the name of the kind for the first component of the errors, followed by that of the component for others;
-        and `initial`, the errors before the first step.
+        and `initial`, the errors before the first step. `at_limit` says which `refined` answers have a joint within
+        2 % of its range of a limit.
         """
         goal_key, pose_key = jax.random.split(key)
         goals = jax.vmap(self.sample_goal)(jax.random.split(goal_key, n))
@@ -355,11 +359,13 @@ class ArmGoalEnv(Task):
             "episode": episode,
             "initial": state.metrics,
         }
-        return {
+        found = {
             kind if i == 0 else f"{kind}_{component}": errors[component]
             for kind, errors in kinds.items()
             for i, component in enumerate(self.components)
         }
+        near = jnp.abs(refined.action) > 1 - 2 * NEAR_LIMIT
+        return {**found, "at_limit": (near & ~np.array(self.turns)).any(-1)}
 
     def watch(self, act: Act, key: jax.Array) -> dict[str, jax.Array]:
         """Mean errors of one answer to a few hundred goals, `policy_<component>`."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv
+from arm5dof.envs.arm_goal import AT_LIMIT, ArmGoalConfig, ArmGoalEnv
 from arm5dof.envs.base import vectors
 from arm5dof.envs.metrics import Error, Metric
 from arm5dof.envs.physics import Physics
@@ -35,7 +35,10 @@ class Reach(ArmGoalEnv):
     Config: ClassVar[type] = ReachConfig
     config: ReachConfig
     components: ClassVar[dict[str, Error]] = {"distance": Error()}
-    metrics: ClassVar[dict[str, Metric]] = dict.fromkeys(("one_shot", "refined", "episode", "policy_distance"), Error())
+    metrics: ClassVar[dict[str, Metric]] = {
+        **dict.fromkeys(("one_shot", "refined", "episode", "policy_distance"), Error()),
+        "at_limit": AT_LIMIT,
+    }
 
     @property
     def goal_inputs(self) -> dict[str, tuple[str, ...]]:

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Gt
 
 from arm5dof.arm import se3
-from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv
+from arm5dof.envs.arm_goal import AT_LIMIT, ArmGoalConfig, ArmGoalEnv
 from arm5dof.envs.base import Act, vectors
 from arm5dof.envs.metrics import Error, Metric, Share
 from arm5dof.envs.physics import Physics
@@ -61,6 +61,7 @@ class ReachPose(ArmGoalEnv):
         **dict.fromkeys(("one_shot", "refined", "episode", "policy_distance"), Error()),
         **dict.fromkeys(("one_shot_angle", "refined_angle", "episode_angle", "policy_angle"), ANGLE),
         **{f"{kind}_within": Share(f"within {mm:g} mm and {deg:g} deg") for kind, (mm, deg) in WITHIN.items()},
+        "at_limit": AT_LIMIT,
     }
 
     @property

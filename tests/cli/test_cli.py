@@ -87,7 +87,8 @@ def test_eval_json_has_exactly_these_keys_and_repeats_itself(trained, capsys):
         return json.loads(capsys.readouterr().out)
 
     found = evaluate(1)
-    assert list(found) == ["one_shot", "refined", "episode"]
+    assert list(found) == ["one_shot", "refined", "episode", "at_limit"]
+    assert 0 <= found.pop("at_limit")["percent"] <= 100
     for accuracy in found.values():
         assert list(accuracy) == ["median_mm", "p95_mm", "within"]
         assert list(accuracy["within"]) == ["1", "5", "10", "20"]
