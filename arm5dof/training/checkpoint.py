@@ -13,6 +13,7 @@ import hashlib
 import json
 import logging
 import sys
+import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -27,6 +28,7 @@ from arm5dof.errors import UserError
 
 T = TypeVar("T")
 KEEP = 2
+SPECIAL = frozenset("*?[]\\")
 
 
 class Checkpoints:
@@ -60,12 +62,15 @@ class Checkpoints:
             create=not read_only,
             read_only=read_only,
         )
+        self._open = contextlib.ExitStack()
         with _as_user_error(f"cannot open the checkpoints in {folder}"):
-            self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+            path = self._open.enter_context(_plain(folder.resolve(), create=not read_only))
+            self._manager = ocp.CheckpointManager(path, options=options)
+        self._open.callback(self._manager.close)
 
     def close(self) -> None:
         """Let go of orbax's threads: a process may train thousands of runs."""
-        self._manager.close()
+        self._open.close()
 
     @property
     def latest(self) -> int | None:
@@ -73,7 +78,8 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, training: Training) -> None:
-        """Write a checkpoint. It counts once it is complete; until then, and if it fails, the last one does."""
+        """Write a checkpoint. It counts once it is complete and was read back; until then, and if it fails, the last
+        one does."""
         import orbax.checkpoint as ocp
 
         items = {"networks": _leaves(training.networks), "training": _leaves(training.replace(networks=None))}
@@ -81,15 +87,22 @@ class Checkpoints:
         record |= {"settings": self._settings, "budget": self._budget}
         kept = "" if self.latest is None else ", the last complete one is kept"
         failure = f"cannot write a checkpoint to {self.folder}{kept}"
+        step = int(training.steps)
         with _as_user_error(failure):
             self._manager.save(
-                int(training.steps),
+                step,
                 args=ocp.args.Composite(
                     record=ocp.args.JsonSave(record),
                     **{name: ocp.args.StandardSave(leaves) for name, leaves in items.items()},
                 ),
             )
             self._manager.wait_until_finished()
+            try:
+                for name, leaves in items.items():
+                    self._restore(step, name, _abstract(leaves), record)
+            except Exception:
+                self._manager.delete(step)
+                raise
 
     def restore(self, like: Training) -> Training:
         """The newest checkpoint, bit for bit. `like` gives shapes and types (`jax.eval_shape` of `DDPG.init`)."""
@@ -108,27 +121,31 @@ class Checkpoints:
         return {name: (before[name], v) for name, v in self._budget.items() if name in before and before[name] != v}
 
     def _read(self, item: str, like: T) -> T:
-        import orbax.checkpoint as ocp
-
         step = self.latest
         if step is None:
             raise UserError(f"{self.folder} holds no complete checkpoint yet")
         template = {name: _storable(leaf) for name, leaf in named(like).items() if leaf.size}
-        abstract = {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in template.items()}
+        abstract = _abstract(template)
         with self._damage(step):
-            record = self._record(step)[item]
+            record = self._record(step)
             expected = {name: [list(leaf.shape), str(leaf.dtype)] for name, leaf in abstract.items()}
-            if expected != record["leaves"]:
+            if expected != record[item]["leaves"]:
                 raise UserError(
                     f"the checkpoint {self.folder / str(step)} does not fit the run's config.toml: it is of another "
                     "run or version"
                 )
-            restored = self._manager.restore(
-                step, args=ocp.args.Composite(**{item: ocp.args.StandardRestore(abstract)})
-            )[item]
-            if _describe(restored)["sha256"] != record["sha256"]:
-                raise ValueError("its contents do not match their digest")
+            restored = self._restore(step, item, abstract, record)
         return rebuild(like, restored)
+
+    def _restore(self, step: int, item: str, abstract: dict[str, Any], record: Mapping[str, Any]) -> dict[str, Any]:
+        """An item's leaves of given shapes and types. Raises `ValueError`, or what orbax does, if it is damaged."""
+        import orbax.checkpoint as ocp
+
+        args = ocp.args.Composite(**{item: ocp.args.StandardRestore(abstract)})
+        restored: dict[str, Any] = self._manager.restore(step, args=args)[item]
+        if _describe(restored)["sha256"] != record[item]["sha256"]:
+            raise ValueError("its contents do not match their digest")
+        return restored
 
     def _record(self, step: int) -> dict[str, Any]:
         """What a checkpoint says of itself. Raises `UserError` if it was made with other settings."""
@@ -153,6 +170,28 @@ class Checkpoints:
         """What is said of a checkpoint that cannot be read."""
         where = self.folder / str(step)
         return _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one")
+
+
+@contextlib.contextmanager
+def _plain(folder: Path, create: bool) -> Iterator[Path]:
+    """A path to a folder without the characters that orbax takes for patterns and tensorstore for separators: the
+    folder's own, or a link to it."""
+    if not SPECIAL & set(str(folder)):
+        yield folder
+        return
+    if create:
+        folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="arm5dof-") as place:
+        if SPECIAL & set(place):
+            raise UserError(f"checkpoints need a folder for temporary files without any of {' '.join(sorted(SPECIAL))}")
+        link = Path(place) / "checkpoints"
+        link.symlink_to(folder, target_is_directory=True)
+        yield link
+
+
+def _abstract(leaves: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shapes and types of named leaves."""
+    return {name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
 
 
 def named(tree: Any) -> dict[str, Any]:

@@ -14,10 +14,12 @@ from pathlib import Path
 import jax
 import mujoco
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 import tomli_w
 from helpers.errors import said
 
+from arm5dof.cli import main as cli
 from arm5dof.ddpg import DDPGConfig
 from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.runtime import files
@@ -144,6 +146,28 @@ def test_half_a_run_goes_on_to_the_same_end_anywhere(runs: dict[str, Path], else
     assert run.evaluations == whole.evaluations
     timeless = lambda run: {name: values for name, values in run.metrics.items() if name != "seconds"}
     assert timeless(run) == timeless(whole)
+
+
+@pytest.mark.parametrize("name", ["sweep[lr=0.1]", "[/b]", r"back\slash", "what*?", "a b", "\u00e4\u65e5", "x" * 200])
+def test_a_folder_may_have_any_name(runs: dict[str, Path], elsewhere: Path, name: str, capsys: pytest.CaptureFixture):
+    """Orbax takes brackets for patterns, tensorstore a backslash for a separator, and rich [/b] for its markup."""
+    folder = copy(runs["half"], elsewhere / name)
+    assert cli.main(["train", "--resume", str(folder)]) == 1  # So short a training reaches nothing.
+    assert f"resuming {folder}" in capsys.readouterr().err
+    found, expected = final_state(Run.open(folder)), final_state(Run.open(runs["finished"]))
+    assert found.keys() == expected.keys()
+    assert all(np.array_equal(found[leaf], value) for leaf, value in expected.items())
+
+
+def test_a_checkpoint_that_cannot_be_read_back_does_not_count(runs: dict[str, Path], elsewhere: Path, monkeypatch):
+    folder, write = copy(runs["half"], elsewhere / "half"), ocp.args.StandardSave
+    before = final_state(Run.open(folder))
+    other = lambda leaves: write({name: np.zeros_like(values) for name, values in leaves.items()})
+    monkeypatch.setattr(ocp.args, "StandardSave", other)
+    told = said(lambda: resume(Run.open(folder)))
+    assert "the last complete one is kept" in told and "do not match their digest" in told
+    after = final_state(Run.open(folder))
+    assert all(np.array_equal(after[leaf], value) for leaf, value in before.items())
 
 
 MAY_CHANGE = {
