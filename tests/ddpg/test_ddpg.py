@@ -347,8 +347,9 @@ def test_actor_ascends_eq_5(bench: Bench):
 
 def test_the_actor_leaves_its_limits(bench: Bench):
     """The gradient that `limit_weight` adds to Eq. 5 is that of the cost, weighted by the heads' shares."""
-    weight, obs, actor = np.asarray(bench.batch.weight), bench.batch.obs, bench.training.networks.actor
-    (without, _), (after, _) = bench.update(limit_weight=0.0), bench.update(limit_weight=0.5)
+    obs = {name: 5 * values for name, values in bench.batch.obs.items()}  # For which actions are large.
+    batch, weight, actor = replace(bench.batch, obs=obs), np.asarray(bench.batch.weight), bench.training.networks.actor
+    (without, _), (after, _) = bench.update(batch, limit_weight=0.0), bench.update(batch, limit_weight=0.5)
     mu = lambda actor: bench.agent.actor.apply(actor, obs["state"])
     privileged = jnp.repeat(obs["privileged_state"][:, None], bench.config.heads, axis=1)
     q = np.asarray(q_of(bench, after.networks.critic, privileged, mu(actor)))
