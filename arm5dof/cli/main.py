@@ -27,6 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from arm5dof.runtime import xla  # Asks for versions, which takes as long as all else that help needs.
 
         xla.enable_compilation_cache()
+        xla.check_platform()
         return int(args.run(args, rest) or 0)
     except UserError as error:
         print(f"arm5dof: {error}", file=sys.stderr)

@@ -6,10 +6,14 @@ import gc
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
+from typing import Any
+
+from arm5dof.errors import UserError
 
 FUSION_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
 """Worth 4 to 8 times in `mjx.step` on a CPU; it concerns no other back end."""
@@ -77,8 +81,8 @@ _programs: Path | None = None
 def enable_compilation_cache() -> None:
     """Keep compiled and traced programs on disk between runs, unless the user has said where or wants none."""
     global _programs
-    root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(root / "arm5dof" / "xla"))
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_cache() / "arm5dof" / "xla")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
     seconds = os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     if "jax" in sys.modules:  # It has read its environment already.
         import jax
@@ -86,6 +90,45 @@ def enable_compilation_cache() -> None:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", float(seconds))
     _programs = Path(folder) / "traced"
+
+
+def _cache() -> Path:
+    """The user's folder for caches. One without a home, as in many containers, has it among temporary files, and so
+    has matplotlib then, which would look for a home, too."""
+    if (given := Path(os.environ.get("XDG_CACHE_HOME", ""))).is_absolute():
+        return given
+    try:
+        return Path.home() / ".cache"
+    except RuntimeError:
+        folder = Path(tempfile.gettempdir()) / f"cache-{os.getuid()}"
+        os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
+        return folder
+
+
+def check_platform() -> None:
+    """Raise `UserError` if the user asked for devices that JAX does not find."""
+    asked = os.environ.get("JAX_PLATFORMS")
+    if not asked:
+        return
+    import jax
+
+    try:
+        jax.devices()
+    except Exception as error:  # AssertionError, RuntimeError: it depends on what is installed.
+        raise UserError(
+            f"JAX_PLATFORMS={asked}: JAX finds no such device here; unset it, or install its plugin"
+        ) from error
+
+
+def check_numbers() -> None:
+    """Raise `UserError` if JAX is set to other arithmetic than what this package is written for."""
+    import jax
+
+    here: Any = jax.config  # Has what is set for this thread alone as attributes, of which no type checker knows.
+    if here.jax_enable_x64:
+        raise UserError("JAX_ENABLE_X64 is set, but environments and networks are of 32 bits: unset it")
+    if here.jax_numpy_rank_promotion == "raise":
+        raise UserError("JAX_NUMPY_RANK_PROMOTION=raise is set, but this package promotes ranks: unset it")
 
 
 def programs_folder() -> Path | None:

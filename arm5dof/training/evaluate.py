@@ -12,6 +12,7 @@ from annotated_types import Ge
 
 from arm5dof.envs import Task
 from arm5dof.envs.metrics import Metric, Summary
+from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
@@ -85,6 +86,8 @@ def evaluate_together(policies: Policy, targets: int, seeds: Sequence[int]) -> l
 
 def _stream(seed: int) -> jax.Array:
     """Random numbers that training never touches."""
+    if not 0 <= seed < 2**32:
+        raise UserError(f"a seed is a whole number from 0 to 4294967295, not {seed}")
     return jax.random.fold_in(jax.random.key(seed), 0xE7A1)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import psutil
-from annotated_types import Ge
+from annotated_types import Ge, Lt
 
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Task
@@ -30,7 +30,7 @@ WATCHED = 0x9B0E
 class TrainConfig:
     """The budget."""
 
-    seed: Annotated[int, Ge(0)] = static(default=0)
+    seed: Annotated[int, Ge(0), Lt(2**32)] = static(default=0)
     """Of all random numbers: same seed and machine, same bits."""
     episodes: Count = static(default=400, may_change=True)
     """Episodes in all; a multiple of the number of environments. A run may be resumed with more: step sizes, noise and

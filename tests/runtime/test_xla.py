@@ -5,8 +5,11 @@ import subprocess
 import sys
 from importlib import metadata
 
+import jax
 import pytest
+from helpers.errors import said
 
+from arm5dof import load_config, make_env
 from arm5dof.runtime import xla
 
 
@@ -64,3 +67,40 @@ def test_programs_are_kept_in_the_cache_folder(first, tmp_path):
     assert folders(XDG_CACHE_HOME=str(tmp_path)) == [default, f"{default}/traced"]
     assert folders(JAX_COMPILATION_CACHE_DIR="/somewhere") == ["/somewhere", "/somewhere/traced"]
     assert folders(JAX_ENABLE_COMPILATION_CACHE="false")[1] == "None"
+
+
+NO_HOME = """
+import pathlib, sys
+
+def homeless(cls):
+    raise RuntimeError("Could not determine home directory.")
+
+pathlib.Path.home = classmethod(homeless)
+from arm5dof.runtime import xla
+xla.enable_compilation_cache()
+import matplotlib
+print(xla.programs_folder(), matplotlib.get_cachedir())
+"""
+
+
+@pytest.mark.parametrize("given", ["", "relative"])
+def test_a_user_without_a_home_has_a_cache(given, tmp_path):
+    unset = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "MPL", "XDG_"))}
+    environment = {**unset, "XDG_CACHE_HOME": given, "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", NO_HOME]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert all(path.startswith(f"{tmp_path}/cache-") for path in done.stdout.split()), done.stdout
+    assert not (tmp_path / "relative").exists()
+
+
+def test_what_jax_is_set_to_is_refused_where_it_does_not_work():
+    xla.check_numbers()
+    xla.check_platform()
+    with jax.enable_x64(True):
+        assert "JAX_ENABLE_X64" in said(xla.check_numbers)
+    with jax.numpy_rank_promotion("raise"):
+        assert "JAX_NUMPY_RANK_PROMOTION" in said(lambda: make_env(load_config("kinematic.toml")))
+    code = "from arm5dof.runtime import xla; xla.check_platform()"
+    environment = {**os.environ, "JAX_PLATFORMS": "rocm"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert "UserError: JAX_PLATFORMS=rocm: JAX finds no such device here" in done.stderr
