@@ -13,6 +13,10 @@ class UserError(Exception):
         super().__init__(" ".join(message.split()))
 
 
+class Terminated(KeyboardInterrupt):
+    """A request to end (SIGTERM, as clusters send it), which is obeyed where it loses nothing."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str | None:
     """The valid name that is most like another, if any is."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)

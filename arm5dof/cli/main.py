@@ -5,6 +5,8 @@ Declaring commands must be quick, so whatever takes JAX, MuJoCo or OpenCV is imp
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -12,11 +14,14 @@ from collections.abc import Sequence
 from arm5dof import __version__
 from arm5dof.cli import arm, compare, evaluate, export, grasp, solve, sweep, train, vision
 from arm5dof.cli.parser import Parser
-from arm5dof.errors import UserError
+from arm5dof.errors import Terminated, UserError
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command. Returns the exit status: 0, 1 for what came to nothing, 2 for bad input, 130 when interrupted."""
+    """Run a command. Returns the exit status: 0, 1 for what came to nothing, 2 for bad input, and as shells have it 130
+    when interrupted, 143 when asked to end, 141 when nobody reads what is printed."""
     warnings.showwarning = lambda message, *_, **__: print(f"arm5dof: {message}", file=sys.stderr)
     try:
         parser = make_parser()
@@ -28,15 +33,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         xla.enable_compilation_cache()
         xla.check_platform()
-        return int(args.run(args, rest) or 0)
+        status = int(args.run(args, rest) or 0)
+        if sys.stdout is not None:  # As it is where it was closed (>&-).
+            sys.stdout.flush()
+        return status
     except UserError as error:
         print(f"arm5dof: {error}", file=sys.stderr)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Or Python says more when it ends.
+        return 141
     except OSError as error:
         place = f": {error.filename}" if error.filename else ""
-        print(f"arm5dof: {error.strerror or error}{place}; what was complete is kept", file=sys.stderr)
-    except KeyboardInterrupt:
-        print("arm5dof: interrupted; a training goes on with arm5dof train --resume RUN", file=sys.stderr)
-        return 130
+        kept = "; what was complete is kept" if error.errno in NO_ROOM else ""
+        print(f"arm5dof: {error.strerror or error}{place}{kept}", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"arm5dof: {str(stop) or 'interrupted'}", file=sys.stderr)
+        return 143 if isinstance(stop, Terminated) else 130
     return 2
 
 

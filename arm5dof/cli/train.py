@@ -121,6 +121,10 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
         if args.resume is None and current.has_checkpoint:
             raise UserError(f"{error}; go on with arm5dof train --resume {current.folder}") from None
         raise
+    except KeyboardInterrupt as stop:
+        if not current.has_checkpoint:
+            raise type(stop)("interrupted before the first checkpoint") from None
+        raise type(stop)(f"interrupted; go on with arm5dof train --resume {current.folder}") from None
     print(tables(current.env.metrics, current.evaluations[-1]))
     print(f"figure and report: {current.folder / 'report.md'}")
     if failure := current.env.failure(current.evaluations[-1]):

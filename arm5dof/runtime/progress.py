@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -22,6 +23,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from arm5dof.errors import Terminated
+
 LINE_EVERY_S = 10.0
 
 PATIENCE_S = 2.0
@@ -32,7 +35,8 @@ class Bar:
     """A progress bar on stderr with rate, ETA and a note; where stderr is no terminal, a line every ten seconds.
 
     `total` is None where nobody knows it: then there is no ETA. An interrupt (Ctrl-C) that gets lost while it is shown,
-    as in a callback of the garbage collector, of which JAX has one, is raised again by the next `update`.
+    as in a callback of the garbage collector, of which JAX has one, is raised again by the next `update`, and a request
+    to end (SIGTERM) is raised there as `Terminated`.
     """
 
     def __init__(self, what: str, total: int | None, unit: str, done: int = 0) -> None:
@@ -53,32 +57,39 @@ class Bar:
             disable=not self._console.is_terminal,
             transient=True,
             # Rich would send what is printed meanwhile to stderr: right on one terminal, wrong into a file or pipe.
-            redirect_stdout=sys.stdout.isatty(),
+            redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),
         )
         self._task = self._progress.add_task(what, total=total, completed=done, note="")
-        self._listens = self._interrupted = False
+        self._before: dict[signal.Signals, Any] = {}
+        self._stop: type[KeyboardInterrupt] | None = None
 
     def __enter__(self) -> Bar:
         self._progress.start()
-        main = threading.current_thread() is threading.main_thread()
-        self._listens = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        if self._listens:
-            signal.signal(signal.SIGINT, self._interrupt)
+        if threading.current_thread() is threading.main_thread():
+            for number, usual, ours in (
+                (signal.SIGINT, signal.default_int_handler, self._interrupt),
+                (signal.SIGTERM, signal.SIG_DFL, self._terminate),
+            ):
+                if signal.getsignal(number) is usual:
+                    self._before[number] = signal.signal(number, ours)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._listens:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
         self._progress.stop()
 
     def _interrupt(self, *_: object) -> None:
-        self._interrupted = True
+        self._stop = KeyboardInterrupt
         raise KeyboardInterrupt
+
+    def _terminate(self, *_: object) -> None:
+        self._stop = Terminated
 
     def update(self, done: int, note: str = "") -> None:
         """Move to `done` and show a note."""
-        if self._interrupted:
-            raise KeyboardInterrupt
+        if self._stop:
+            raise self._stop
         self.done = done
         self._progress.update(self._task, completed=done, note=note)
         now = time.monotonic()

@@ -8,6 +8,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
 
+import jax
+
 from arm5dof.envs import Task
 from arm5dof.training import curves, evaluate, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
@@ -135,24 +137,36 @@ def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter
     started = time.monotonic()
 
     with curves.appending(run.folder, rows) as write, logging(run, loggers, rows, evaluations) as log:
-        while True:
-            at = made.counters
-            due = made.due(at, budget.evaluate_every)
-            if (due or made.finished) and all(e["steps"] != at.steps for e in evaluations):
-                evaluations.append(_evaluate(run, made, reporter))
-                curves.write_evaluations(run.folder, evaluations)
-                log.evaluation(evaluations[-1])
-            if made.finished:
-                break
-            metrics = made.advance()
-            at, seconds = made.counters, time.monotonic() - started
-            rows.append(trainer.row(at, before + seconds, metrics))
-            write(rows[-1])
-            log.epoch(rows[-1])
-            reporter.update(at.episodes, _note(made.env, rows, metrics))
-            if made.due(at, budget.checkpoint_every) or made.finished:
-                checkpoints.save(made.state)
+        try:
+            while True:
+                at = made.counters
+                due = made.due(at, budget.evaluate_every)
+                if (due or made.finished) and all(e["steps"] != at.steps for e in evaluations):
+                    evaluations.append(_evaluate(run, made, reporter))
+                    curves.write_evaluations(run.folder, evaluations)
+                    log.evaluation(evaluations[-1])
+                if made.finished:
+                    break
+                metrics = made.advance()
+                at, seconds = made.counters, time.monotonic() - started
+                rows.append(trainer.row(at, before + seconds, metrics))
+                write(rows[-1])
+                log.epoch(rows[-1])
+                reporter.update(at.episodes, _note(made.env, rows, metrics))
+                if made.due(at, budget.checkpoint_every) or made.finished:
+                    checkpoints.save(made.state)
+        except KeyboardInterrupt:
+            _save_at_once(made, checkpoints)
+            raise
     report.write(run.folder, run.config, made.env, rows, evaluations)
+
+
+def _save_at_once(made: Trainer, checkpoints: Checkpoints) -> None:
+    """Save what has been trained since the last checkpoint, unless the interrupt came in the middle of an epoch, which
+    takes the state before it."""
+    lost = any(leaf.is_deleted() for leaf in jax.tree.leaves(made.state))
+    if not lost and made.counters.steps > (checkpoints.latest or 0):
+        checkpoints.save(made.state)
 
 
 def _evaluate(run: Run, made: Trainer, reporter: Reporter) -> dict[str, Any]:
