@@ -13,6 +13,10 @@ class UserError(Exception):
         super().__init__(" ".join(message.split()))
 
 
+class DivergedError(Exception):
+    """A training came to numbers that are not finite. The command line prints it and exits with 1."""
+
+
 class Terminated(KeyboardInterrupt):
     """A request to end (SIGTERM, as clusters send it), which is obeyed where it loses nothing."""
 

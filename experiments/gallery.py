@@ -52,10 +52,6 @@ ARMS = {
     "lite6": Public("UFACTORY Lite 6", "ufactory_lite6/lite6.xml"),
     "sawyer": Public("Rethink Sawyer", "rethink_robotics_sawyer/sawyer.xml"),
     "vx300s": Public("Trossen ViperX 300", "trossen_vx300s/vx300s.xml"),
-    "xarm7": Public("UFACTORY xArm7", "ufactory_xarm7/xarm7.xml"),
-    "fr3": Public("Franka FR3", "franka_fr3/fr3.xml"),
-    "piper": Public("AgileX Piper", "agilex_piper/piper.xml"),
-    "ur10e": Public("Universal Robots UR10e", "universal_robots_ur10e/ur10e.xml"),
 }
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.arm import Arm
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if dynamics["servo"]["works"]:
         dynamics["servo"].update(_settling(arm))
     if args.json:
-        print(json.dumps(_as_json(arm, dynamics)))
+        print(files.to_json(_as_json(arm, dynamics)))
     else:
         print(f"kinematic dynamics: {'yes' if dynamics['kinematic']['works'] else dynamics['kinematic']['reason']}")
         print(f"servo dynamics: {_servos(dynamics['servo'])}")

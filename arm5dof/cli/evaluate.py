@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from arm5dof.cli.parser import natural, nothing_left, positive
+from arm5dof.runtime import files
 
 HELP = """\
 Measure a policy on targets that it has never seen, or on episodes where its task has no targets.
@@ -38,4 +38,4 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         results = opened.evaluate(args.targets, args.seed, bar.update)
     metrics = opened.env.metrics
     shown = {name: summary for name, summary in results.items() if name in metrics}
-    print(json.dumps(shown) if args.json else tables(metrics, shown))
+    print(files.to_json(shown) if args.json else tables(metrics, shown))

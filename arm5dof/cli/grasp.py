@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 from arm5dof.cli.joints import by_unit, for_people
 from arm5dof.cli.parser import natural, nothing_left, positive
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.grasp.evaluation import Program
@@ -106,10 +106,10 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
     if args.scenes > 1:
         with Bar("grasping", args.scenes, "scenes") as bar:
             score = evaluate(setting, args.scenes, bar.update)
-        print(json.dumps(score.as_json()) if args.json else table(score))
+        print(files.to_json(score.as_json()) if args.json else table(score))
         return 0
     if args.json:
-        print(json.dumps(Score((trial,)).as_json()))
+        print(files.to_json(Score((trial,)).as_json()))
     elif trial.success and trial.reachable:
         print(f"{trial.asked}: done")
     else:
@@ -129,7 +129,6 @@ def _watched(program: Program, video: Path | None, quiet: bool) -> Trial:
     if video is None:
         return program.trial(0, lambda *_: Teller())
     from arm5dof.grasp.video import Recorder
-    from arm5dof.runtime import files
 
     with files.replacing(video) as temporary:
         recorders: list[Recorder] = []
@@ -184,7 +183,7 @@ def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, floa
         for one in robot.commands
     ]
     if args.json:
-        print(json.dumps(commands))
+        print(files.to_json(commands))
     else:
         print("  time  opening  " + "  ".join(f"{name:>12}" for name in arm.joint_names) + "  (degrees, slides mm)")
         for one in robot.commands:

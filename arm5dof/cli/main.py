@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from arm5dof import __version__
 from arm5dof.cli import arm, compare, evaluate, export, grasp, solve, sweep, train, vision
 from arm5dof.cli.parser import Parser
-from arm5dof.errors import Terminated, UserError
+from arm5dof.errors import DivergedError, Terminated, UserError
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -39,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except UserError as error:
         print(f"arm5dof: {error}", file=sys.stderr)
+    except DivergedError as error:
+        print(f"arm5dof: {error}", file=sys.stderr)
+        return 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Or Python says more when it ends.
         return 141

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import json
 import math
 import sys
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from arm5dof.cli.joints import by_unit
 from arm5dof.cli.parser import Parser, natural, nothing_left
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.envs import ForwardModel
@@ -75,7 +75,6 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.path and args.all:
         raise UserError("--path wants one answer to each target: leave out --all")
 
-    from arm5dof.runtime import files
     from arm5dof.training.run import Run
 
     policy = Run.open(folder).policy()
@@ -114,7 +113,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         for i in range(len(answer.q))
     ]
     if args.json:
-        print(json.dumps(rows))
+        print(files.to_json(rows))
     elif args.csv is None:
         print("\n".join(_line(row, inputs, units) for row in rows))
     if args.csv is not None and not (args.json and args.out is None):

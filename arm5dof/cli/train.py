@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arm5dof.errors import UserError
+from arm5dof.errors import DivergedError, UserError
 
 if TYPE_CHECKING:
     from arm5dof.training.config import Config
@@ -121,6 +121,9 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
         if args.resume is None and current.has_checkpoint:
             raise UserError(f"{error}; go on with arm5dof train --resume {current.folder}") from None
         raise
+    except DivergedError as error:
+        more = f"; the last checkpoint is kept in {current.folder}" if current.has_checkpoint else ""
+        raise DivergedError(f"the training diverged: {error}: try a smaller actor_lr or critic_lr{more}") from None
     except KeyboardInterrupt as stop:
         if not current.has_checkpoint:
             raise type(stop)("interrupted before the first checkpoint") from None

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from arm5dof.ddpg import Training
 from arm5dof.runtime import xla
-from arm5dof.sweeps.worker import DIVERGED, DONE, Ending, finish, not_finite
+from arm5dof.sweeps.worker import DIVERGED, DONE, Ending, finish
 from arm5dof.training import curves, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import Config
@@ -182,7 +182,7 @@ def _train_on(
         metrics = population.advance()
         at, seconds = population.counters, offset + time.monotonic()
         for number, member in list(alive.items()):
-            if lost := not_finite(metrics[number]):
+            if lost := trainer.not_finite(metrics[number]):
                 finish(folder, member.name, Ending(DIVERGED, f"{lost} by episode {at.episodes}"))
                 del alive[number]
                 continue

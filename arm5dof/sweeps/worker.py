@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import queue
 import shutil
@@ -18,7 +17,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from arm5dof.errors import UserError
+from arm5dof.errors import DivergedError, UserError
 from arm5dof.runtime import files, xla
 from arm5dof.sweeps.groups import shape
 from arm5dof.sweeps.spec import Member
@@ -75,28 +74,8 @@ class Job:
         return Job(**{**values, "members": members, "trial": trial, "loggers": loggers})
 
 
-class DivergedError(Exception):
-    """A member's training came to numbers that are not finite."""
-
-
 class PrunedError(Exception):
     """A member was told to stop early."""
-
-
-class Finite(Trainer):
-    """A training program that stops where its numbers are no longer finite."""
-
-    def advance(self) -> dict[str, float]:
-        metrics = super().advance()
-        if lost := not_finite(metrics):
-            raise DivergedError(f"{lost} by episode {self.counters.episodes}")
-        return metrics
-
-
-def not_finite(metrics: Mapping[str, float]) -> str:
-    """What of an epoch's metrics is no finite number, in words; empty if all are."""
-    lost = [f"{name} is {value}" for name, value in metrics.items() if not math.isfinite(value)]
-    return ", ".join(lost[:2])
 
 
 class Worker:
@@ -141,7 +120,7 @@ class Worker:
             if self._trainer is not None:
                 self._trainer = None
                 jax.clear_caches()
-            self._trainer, self._shape = Finite(config.make_env(settings), settings), wanted
+            self._trainer, self._shape = Trainer(config.make_env(settings), settings), wanted
         return self._trainer
 
     def _train(
@@ -152,7 +131,7 @@ class Worker:
             opened = Run.open(folder)
             if opened.config != settings:
                 raise UserError(f"{folder} is a run of another configuration: move it away")
-            made: Trainer = Finite(opened.env, settings)  # With the robot that it was begun with.
+            made = Trainer(opened.env, settings)  # With the robot that it was begun with.
         else:
             for leftover in folder.parent.glob(f".{folder.name}-*"):  # Of one that was killed while it made its folder.
                 shutil.rmtree(leftover, ignore_errors=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -57,12 +58,22 @@ def read_evaluations(folder: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     with undamaged(path):
-        return [{**e, "steps": int(e["steps"])} for e in json.loads(path.read_text(encoding="utf-8"))]
+        found = _numbers(json.loads(path.read_text(encoding="utf-8")))
+        return [{**e, "steps": int(e["steps"])} for e in found]
+
+
+def _numbers(value: Any) -> Any:
+    """What was read from JSON, NaN where it has null."""
+    if isinstance(value, dict):
+        return {name: _numbers(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_numbers(inner) for inner in value]
+    return math.nan if value is None else value
 
 
 def write_evaluations(folder: Path, evaluations: list[dict[str, Any]]) -> None:
     """Replace the evaluations."""
-    files.write_text(folder / EVALUATIONS, json.dumps(evaluations, indent=1) + "\n")
+    files.write_text(folder / EVALUATIONS, files.to_json(evaluations, indent=1) + "\n")
 
 
 @contextmanager

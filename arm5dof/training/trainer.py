@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple, Protocol
@@ -14,7 +16,7 @@ from annotated_types import Ge, Lt
 
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Task
-from arm5dof.errors import UserError
+from arm5dof.errors import DivergedError, UserError
 from arm5dof.runtime import xla
 from arm5dof.runtime.programs import Program
 from arm5dof.settings import settings, static
@@ -102,8 +104,14 @@ class Trainer:
         return self._init.eval_shape(self.config.ddpg, jax.random.key(0))
 
     def check(self) -> None:
-        """Raises `UserError` if the replay buffer cannot fit into the device's memory, or the arm has something that
-        its dynamics cannot simulate."""
+        """Raises `UserError` if the replay buffer cannot fit into the device's memory, or never fills a batch, or the
+        arm has something that its dynamics cannot simulate."""
+        most = min(self.config.ddpg.replay_capacity, self.total_steps * self.config.train.num_envs)
+        if most < self.config.ddpg.batch_size:
+            raise UserError(
+                f"batch_size = {self.config.ddpg.batch_size}, but the replay buffer never holds more than {most} "
+                "transitions: nothing would be learnt; choose a smaller batch_size, or more episodes"
+            )
         needed, free = self.replay_bytes, memory_free()
         if needed > free:
             raise UserError(
@@ -127,11 +135,14 @@ class Trainer:
 
     def advance(self) -> dict[str, float]:
         """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and what the
-        task has to watch of the policy without noise."""
+        task has to watch of the policy without noise. Raises `DivergedError` if one of them is no finite number."""
         leaves, metrics = self._epoch.result()(*self._leaves(self.state))
         self.state = jax.tree.unflatten(jax.tree.structure(self.like), leaves)
         metrics.update(self._watch())
-        return {name: float(value) for name, value in jax.device_get(metrics).items()}
+        found = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        if lost := not_finite(found):
+            raise DivergedError(f"{lost} by episode {self.counters.episodes}")
+        return found
 
     @cached_property
     def _program(self) -> Program:
@@ -213,3 +224,9 @@ class Counters(NamedTuple):
 def row(counters: Counters, seconds: float, metrics: dict[str, Any]) -> dict[str, Any]:
     """One line of `metrics.csv`."""
     return {**counters._asdict(), "seconds": round(seconds, 2), **metrics}
+
+
+def not_finite(metrics: Mapping[str, float]) -> str:
+    """What of an epoch's metrics is no finite number, in words; empty if all are."""
+    lost = [f"{name} is {value}" for name, value in metrics.items() if not math.isfinite(value)]
+    return ", ".join(lost[:2])

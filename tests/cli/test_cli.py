@@ -284,6 +284,15 @@ def test_train_refuses_broken_models(fails, tmp_path, monkeypatch):
     assert not (tmp_path / "runs").exists()
 
 
+def test_what_learns_nothing_is_refused_and_what_diverges_says_so(fails, tmp_path, capsys):
+    few = fails("train", *TINY.split(), "--batch-size", 4096, "--out", tmp_path / "few")
+    assert "batch_size = 4096" in few and "never holds more than 128 transitions" in few
+    assert not (tmp_path / "few").exists()
+    assert run("train", *TINY.split(), "--critic-lr", 1e30, "--out", tmp_path / "lost") == 1
+    err = capsys.readouterr().err
+    assert "arm5dof: the training diverged: " in err and "try a smaller actor_lr" in err and "Traceback" not in err
+
+
 def test_runs_never_overwrite_each_other(trained, fails, tmp_path, monkeypatch):
     before = digest(trained)
     assert "exists" in fails("train", *TINY.split(), "--out", trained)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import options
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.vision.calibration.intrinsics import Calibration
@@ -58,7 +58,6 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.preview is not None:
         options.writable(args.preview, (".png", ".jpg"))
 
-    from arm5dof.runtime import files
     from arm5dof.runtime.progress import late_bar
     from arm5dof.vision.calibration.intrinsics import calibrate, preview
     from arm5dof.vision.calibration.views import find_views, image_names
@@ -77,7 +76,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
             stack.enter_context(files.replacing(args.preview)).write_bytes(encoded)
         result.save(args.out, board)
     if args.json:
-        print(json.dumps(as_json(views, result)))
+        print(files.to_json(as_json(views, result)))
     else:
         print(f"{calibration_table(views, result)}\ncamera: {args.out}")
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.vision.evaluation.detection import Result
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
     with Bar("evaluating", args.scenes, "scenes") as bar:
         result = evaluate(args.weights, args.scenes, args.seed, args.back_end, args.tta, bar.update)
-    print(json.dumps(result.as_json()) if args.json else precision_and_positions(result))
+    print(files.to_json(result.as_json()) if args.json else precision_and_positions(result))
 
 
 def precision_and_positions(result: Result) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
+from arm5dof.runtime import files
 
 HELP = """\
 Find where a camera stands, or sits on the hand, from photographs of a board and the hand's poses.
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.json:
         more = {"frame": frame, "rotation_deg": left.rotation_deg, "translation_m": left.translation_m}
         more |= {"used": found.used, "without_board": found.without}
-        print(json.dumps(camera_report.as_json(found.camera) | more))
+        print(files.to_json(camera_report.as_json(found.camera) | more))
         return
     print(camera_report.pose_table(found.camera, frame))
     error = f"{left.rotation_deg:.2f} degrees and {1e3 * left.translation_m:.1f} mm RMS"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import detecting
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.vision.camera import Camera
@@ -197,7 +197,7 @@ def _run_on_lists(args: argparse.Namespace) -> int:
             answers.append((name, locate(found, cameras)))
             bar.update(len(answers), name or "")
     if args.json:
-        print(json.dumps([localizations.as_json(*answer) for answer in answers]))
+        print(files.to_json([localizations.as_json(*answer) for answer in answers]))
     else:
         print("\n".join(localizations.as_text(*answer) for answer in answers))
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         camera = from_board(Camera.load(args.camera), args.image, board, board_to_base, placement_std)
     camera.save(args.out, {"board": str(board), "square_size": board.square})
     if args.json:
-        print(json.dumps(camera_report.as_json(camera)))
+        print(files.to_json(camera_report.as_json(camera)))
     else:
         print(f"{camera_report.pose_table(camera)}\ncamera: {args.out}")
 
