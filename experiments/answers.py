@@ -42,12 +42,14 @@ def main() -> None:
         rows.append([folder.name, str(policy.env.arm.dof), *lines(policy), *beyond])
         print(rows[-1], flush=True)
     header = ("arm", "joints", "lines", "followed", "of the first", "by mink", *(f"{s:g} of the reach" for s in BEYOND))
-    text = (
-        f"# Lines and what is out of reach\n\nCommand: `python experiments/answers.py RUN ...`. {platform.machine()} CPU,"
-        f" {xla.cores()} cores.\nFollowed: every point within 1 mm and no joint that moves by more than {JUMP} rad from "
-        f"one point to the next.\nOut of reach: how much farther than the nearest possible, worst of {FAR} points; how "
-        f"many miss by\nmore than 1.1 times that and 2 mm.\n\n{Table('', header, rows).markdown()}\n"
+    command = f"Command: `python experiments/answers.py RUN ...`. {platform.machine()} CPU, {xla.cores()} cores."
+    explained = (
+        f"Followed: every point within 1 mm, no joint that moves by more than {JUMP} rad from one to the next.\n"
+        f"Out of reach: how much farther than the nearest possible, worst of {FAR} points; how many miss by more than\n"
+        "1.1 times that and 2 mm."
     )
+    table = Table("", header, rows).markdown()
+    text = f"# Lines and what is out of reach\n\n{command}\n{explained}\n\n{table}\n"
     print(text)
     files.write_text(RESULTS / "answers.md", text)
 
