@@ -51,7 +51,7 @@ ARMS = {
     "z1": Public("Unitree Z1", "unitree_z1/z1.xml"),
     "lite6": Public("UFACTORY Lite 6", "ufactory_lite6/lite6.xml"),
     "sawyer": Public("Rethink Sawyer", "rethink_robotics_sawyer/sawyer.xml"),
-    "vx300s": Public("Trossen ViperX 300", "trossen_vx300s/vx300s.xml"),
+    "xarm7": Public("UFACTORY xArm7", "ufactory_xarm7/xarm7.xml"),
 }
 
 
