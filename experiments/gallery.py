@@ -148,8 +148,9 @@ def reached(arm: Any, q: np.ndarray) -> np.ndarray:
 def picture(name: str, public: Public, file: Path) -> np.ndarray:
     """What `arm5dof arm --figure` draws, (CELL, CELL, 3), with the name below."""
     path = OUT / f"{name}.png"
-    command = [*COMMAND, "arm", str(file), *tool(public), "--figure", str(path)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    if not path.exists():
+        command = [*COMMAND, "arm", str(file), *tool(public), "--figure", str(path)]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     image = cv2.resize(cv2.imread(str(path)), (CELL, CELL), interpolation=cv2.INTER_AREA)
     cv2.putText(image, public.title, (8, CELL - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (43, 37, 34), 1, cv2.LINE_AA)
     return image
