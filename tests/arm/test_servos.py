@@ -7,12 +7,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from helpers.soft import soft_arm
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.computed_servos import with_servos
 from arm5dof.arm.servos import MOST_S, Servos
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 ROBOT = """<mujoco><compiler angle="radian"/><option gravity="0 0 {gravity}" integrator="{integrator}"/>
   <worldbody><body>
@@ -29,16 +29,6 @@ def robot(more: str = "", gravity: float = 0, armature: float = 0, integrator: s
 
 def position(kp: float, kv: float) -> str:
     return "<actuator>" + "".join(f'<position joint="{j}" kp="{kp}" kv="{kv}"/>' for j in "ab") + "</actuator>"
-
-
-def soft_arm() -> Arm:
-    """The paper's arm with servos as hobby arms have them: slow, and gravity pulls them down."""
-    spec = mujoco.MjSpec.from_file(str(files.find("mjcf", "reach.xml")))
-    for servo in spec.actuators:
-        servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = 20, -20, -2
-    for body in spec.bodies:
-        body.gravcomp = 0
-    return load_arm(spec)
 
 
 def plain(arm: Arm, q: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:

@@ -9,26 +9,20 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers.soft import soft_arm
 
 from arm5dof import load_config, train
-from arm5dof.arm import Arm, load_arm
+from arm5dof.arm import Arm
 from arm5dof.arm.servos import MOST_S, Servos
 from arm5dof.envs.episodes import settled
 from arm5dof.envs.reach import Reach, ReachConfig
-from arm5dof.runtime import files
 
 N = 40
 
 
 @pytest.fixture(scope="module")
 def soft() -> Arm:
-    """The paper's arm with servos as hobby arms have them: slow, and gravity pulls them down."""
-    spec = mujoco.MjSpec.from_file(str(files.find("mjcf", "reach.xml")))
-    for servo in spec.actuators:
-        servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = 20, -20, -2
-    for body in spec.bodies:
-        body.gravcomp = 0
-    return load_arm(spec)
+    return soft_arm()
 
 
 @pytest.fixture(scope="module")
