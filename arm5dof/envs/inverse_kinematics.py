@@ -49,8 +49,8 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candida
         found = candidates(env, act, goals, corrections, env.branches)
         best = found.reward.argmax(0)
         return nearest(env, act, goals, jax.tree.map(lambda x: x[best, jnp.arange(len(best))], found))
-    actions, order = _ranked(env, act, goals)
-    return _judge(env, goals, actions[jnp.arange(len(order)), order[:, 0]])
+    actions, rewards = _answers(env, act, goals)
+    return _judge(env, goals, actions[jnp.arange(len(actions)), rewards.argmax(1)])
 
 
 def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int, branches: int | None = None) -> Candidate:
@@ -77,7 +77,8 @@ def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int, branc
     def descend(action: jax.Array) -> Candidate:
         return judge(jax.vmap(partial(_descend, env, corrections))(action, goals))
 
-    actions, order = _ranked(env, act, goals)
+    actions, rewards = _answers(env, act, goals)
+    order = jnp.argsort(rewards, descending=True)
     if env.correction == "target":
         if branches == 1:
             return jax.tree.map(lambda x: x[None], follow(order[:, 0]))
@@ -127,16 +128,14 @@ def follow_line(env: ForwardModel, goals: Goal, first: jax.Array) -> Candidate:
     return jax.lax.map(partial(_judge, env, goals), actions)
 
 
-def _ranked(env: ForwardModel, act: Act, goals: Goal) -> tuple[jax.Array, jax.Array]:
-    """A policy's answers to goals, (n, branches, action_size), and which is the best by the forward model, the second
-    best, ..., (n, branches)."""
+def _answers(env: ForwardModel, act: Act, goals: Goal) -> tuple[jax.Array, jax.Array]:
+    """A policy's answers to goals, (n, branches, action_size), and their rewards by the forward model, (n, branches)."""
     actions = act.answers(jax.vmap(env.question)(goals))
 
     def reward(action: jax.Array, goal: Goal) -> jax.Array:
         return env.goal_reward(env.outcome(action), goal, action)[0]
 
-    found = jax.vmap(jax.vmap(reward, (0, None)))(actions, goals)
-    return actions, jnp.argsort(found, descending=True)
+    return actions, jax.vmap(jax.vmap(reward, (0, None)))(actions, goals)
 
 
 def _judge(env: ForwardModel, goals: Goal, action: jax.Array) -> Candidate:
