@@ -74,6 +74,12 @@ class DDPGConfig:
     limit_weight: Annotated[float, Ge(0)] = 0.0
     """What an action near its limits, -1 or 1, costs the actor, in units of reward: so much at the limit, and nothing
     inside `losses.FREE`. Where several actions are as good, those in the middle are learnt."""
+    imitation_weight: Annotated[float, Ge(0)] = static(default=0.0)
+    """How strongly the actor's nearest candidate is drawn to the action that is known to have reached a goal in
+    hindsight, where the critic finds it better than all candidates (Nair et al. 2018, the Q-filter): so branches that
+    no candidate is near are found. For tasks of one step, with goals from the buffer. 0: not at all."""
+    imitation_margin: Annotated[float, Ge(0)] = 0.0
+    """How much better that action must be to count, in units of reward."""
     critic_input: Literal["outcome", "state"] = static(default="state")
     """state: the critic sees the observation and the action; outcome: it sees where the action leads by the task's
     forward model, as the paper's does."""
@@ -258,28 +264,35 @@ class DDPG:
         key, sample_key, relabel_key = jax.random.split(training.key, 3)
         shape = (config.updates_per_step, config.batch_size)
         rows = training.replay.sample(sample_key, shape)
-        batches = self.relabel(config, training.replay, rows, relabel_key)
+        batches, shown = self.relabel(config, training.replay, rows, relabel_key)
         inputs = self.critic_inputs(config, batches)
-        training, metrics = jax.lax.scan(lambda t, x: self.update(config, t, *x), training, (batches, inputs))
+        training, metrics = jax.lax.scan(lambda t, x: self.update(config, t, *x), training, (batches, inputs, shown))
         return training.replace(key=key), jax.tree.map(jnp.mean, metrics)
 
-    def relabel(self, config: DDPGConfig, replay: Replay, rows: jax.Array, key: jax.Array) -> Transition:
+    def relabel(
+        self, config: DDPGConfig, replay: Replay, rows: jax.Array, key: jax.Array
+    ) -> tuple[Transition, jax.Array]:
         """The transitions in rows of the buffer (any leading axes), the goals of a share of them exchanged for what
         others reached (Andrychowicz et al. 2017, hindsight experience replay) or for new ones (Nair et al. 2018). The
-        reward for any goal is known, and whether it ends the episode, so this is exact."""
+        reward for any goal is known, and whether it ends the episode, so this is exact. And the actions to imitate:
+        those that reached these goals, where they come from the buffer, and elsewhere the transitions' own."""
         env, batch = self.goal_env, replay.read(rows)
         if env is None:
-            return batch
+            return batch, batch.action
         shape = batch.reward.shape
         choice_key, goal_key = jax.random.split(key)
         chosen = jax.random.uniform(choice_key, shape) < config.her_ratio
         source: Any
+        shown = batch.action
         if config.her_goals == "reset":
             source, goal_of = jax.random.split(goal_key, shape), lambda key: env.reset(key).info["goal"]
         else:
             buffer = config.her_goals == "buffer"
             donors = replay.sample(goal_key, shape) if buffer else replay.later(goal_key, rows, self.episode_length)
-            source, goal_of = replay.read(donors).next_obs, env.achieved
+            donor = replay.read(donors)
+            source, goal_of = donor.next_obs, env.achieved
+            if buffer:
+                shown = jnp.where(chosen[..., None], donor.action, shown)
 
         def one(transition: Transition, source: Any, chosen: jax.Array) -> Transition:
             goal = goal_of(source)
@@ -294,13 +307,13 @@ class DDPG:
 
         for _ in shape:
             one = jax.vmap(one)
-        return one(batch, source, chosen)
+        return one(batch, source, chosen), shown
 
     def update(
-        self, config: DDPGConfig, training: Training, batch: Transition, critic_input: jax.Array
+        self, config: DDPGConfig, training: Training, batch: Transition, critic_input: jax.Array, shown: jax.Array
     ) -> tuple[Training, Metrics]:
         """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau. `critic_input` is what
-        the critic sees of the batch's observations and actions, (batch, size)."""
+        the critic sees of the batch's observations and actions, (batch, size), `shown` as `relabel` gives it."""
         networks = training.networks
         target = batch.reward + jax.lax.cond(
             config.discount > 0, lambda: self._bootstrap(config, networks, batch), lambda: jnp.zeros_like(batch.reward)
@@ -312,9 +325,15 @@ class DDPG:
 
         def actor_loss(actor: Params) -> jax.Array:
             actions = self.candidates(actor, batch.obs)
-            q = self.value(config, critic, batch.obs, actions)
+            imitate = config.imitation_weight > 0
+            judged = jnp.concatenate([actions, shown[:, None]], axis=1) if imitate else actions
+            q = self.value(config, critic, batch.obs, judged)
             cost = config.limit_weight * losses.limit_cost(actions)
-            return losses.actor_loss(q, batch.weight, config.head_temperature, cost)
+            loss = losses.actor_loss(q[:, : self.actor.heads], batch.weight, config.head_temperature, cost)
+            if imitate:
+                imitation = losses.imitation_loss(actions, q, shown, batch.weight, config.imitation_margin)
+                loss += config.imitation_weight * imitation
+            return loss
 
         rate = config.final_lr + (1 - config.final_lr) * (1 + jnp.cos(jnp.pi * self._progress(training))) / 2
         (loss, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(networks.critic)

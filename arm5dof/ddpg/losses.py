@@ -31,6 +31,17 @@ def actor_loss(
     return -_mean((share * (q - cost)).sum(-1), weight)
 
 
+def imitation_loss(
+    actions: jax.Array, q: jax.Array, shown: jax.Array, weight: jax.Array, margin: jax.Array | float = 0.0
+) -> jax.Array:
+    """How far the nearest of the candidates `actions` (batch, heads, size) is from an action `shown` (batch, size),
+    squared, times by how much more than `margin` the critic prefers that; `q` (batch, heads + 1), the last that of
+    `shown`."""
+    gain = jax.lax.stop_gradient(jnp.maximum(q[:, -1] - q[:, :-1].max(-1) - margin, 0))
+    apart = ((actions - shown[:, None]) ** 2).sum(-1).min(-1)
+    return _mean(gain * apart, weight)
+
+
 def limit_cost(action: jax.Array) -> jax.Array:
     """Sum of squares of how far the components of an action (..., size) lie from `FREE` on towards a limit: 1 for each
     that is at it."""

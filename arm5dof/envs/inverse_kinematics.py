@@ -129,7 +129,7 @@ def follow_line(env: ForwardModel, goals: Goal, first: jax.Array) -> Candidate:
 
 
 def _answers(env: ForwardModel, act: Act, goals: Goal) -> tuple[jax.Array, jax.Array]:
-    """A policy's answers to goals, (n, branches, action_size), and their rewards by the forward model, (n, branches)."""
+    """A policy's answers to goals, (n, branches, action_size), and their rewards by the forward model."""
     actions = act.answers(jax.vmap(env.question)(goals))
 
     def reward(action: jax.Array, goal: Goal) -> jax.Array:

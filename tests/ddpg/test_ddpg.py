@@ -261,9 +261,14 @@ class Bench(NamedTuple):
     training: Training
     batch: Transition
 
-    def update(self, batch: Transition | None = None, **changes: Any) -> tuple[Training, dict[str, jax.Array]]:
+    def update(
+        self, batch: Transition | None = None, shown: Any = None, **changes: Any
+    ) -> tuple[Training, dict[str, jax.Array]]:
         config, batch = replace(self.config, **changes), self.batch if batch is None else batch
-        return jax.jit(self.agent.update)(config, self.training, batch, self.agent.critic_inputs(config, batch))
+        inputs = self.agent.critic_inputs(config, batch)
+        return jax.jit(self.agent.update)(
+            config, self.training, batch, inputs, batch.action if shown is None else shown
+        )
 
 
 @pytest.fixture(scope="module", params=[1, 3], ids=["one head", "three heads"])
@@ -361,6 +366,27 @@ def test_the_actor_leaves_its_limits(bench: Bench):
     found = gradient_used(after.actor_optimizer) - gradient_used(without.actor_optimizer)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
     assert np.abs(expected).max() > 1e-3
+
+
+def test_the_actor_imitates_what_the_critic_prefers(bench: Bench):
+    """The gradient that `imitation_weight` adds draws the nearest head to the action shown, in proportion to how much
+    more than the margin it is worth by the critic than the best head."""
+    obs, weight = bench.batch.obs, np.asarray(bench.batch.weight)
+    shown = jax.random.uniform(jax.random.key(5), bench.batch.action.shape, minval=-1, maxval=1)
+    ask = partial(bench.update, shown=shown, imitation_margin=0.05)
+    (without, _), (after, _) = ask(imitation_weight=0.0), ask(imitation_weight=2.0)
+    mu = lambda actor: bench.agent.actor.apply(actor, obs["state"])
+    actor, critic = bench.training.networks.actor, after.networks.critic
+    action, mu_slope = np.asarray(mu(actor)), flat_rows(jax.jacobian(mu)(actor), 3)
+    heads = np.stack([q_of(bench, critic, obs["privileged_state"], a) for a in action.swapaxes(0, 1)], 1)
+    gain = np.maximum(q_of(bench, critic, obs["privileged_state"], shown) - heads.max(1) - 0.05, 0)
+    away = action - np.asarray(shown)[:, None]
+    nearest = (away**2).sum(-1).argmin(1)
+    rows = np.arange(len(away))
+    slope = np.einsum("i,i,ia,iap->p", weight, gain, 2 * away[rows, nearest], mu_slope[rows, nearest])
+    found = gradient_used(after.actor_optimizer) - gradient_used(without.actor_optimizer)
+    np.testing.assert_allclose(found, 2.0 * slope / weight.sum(), rtol=1e-3, atol=1e-5)
+    assert 0 < (gain > 0).mean() < 1 and np.abs(found).max() > 1e-3
 
 
 def test_the_policy_is_the_head_the_critic_prefers(bench: Bench):
@@ -796,7 +822,7 @@ def test_relabelling_is_exact(paper_arm: Learnt, share: float):
     shape = (4, 1000)
     rows = replay.sample(jax.random.key(1), shape)
     batch = replay.read(rows)
-    new = jax.jit(agent.relabel)(replace(paper_arm.config, her_ratio=share), replay, rows, jax.random.key(2))
+    new, shown = jax.jit(agent.relabel)(replace(paper_arm.config, her_ratio=share), replay, rows, jax.random.key(2))
 
     old_goal, goal = goal_in(env, batch.obs), goal_in(env, new.obs)
     changed = (np.abs(goal - old_goal) > 1e-6).any(-1)
@@ -821,12 +847,16 @@ def test_relabelling_is_exact(paper_arm: Learnt, share: float):
     for point in goal[changed][:200]:
         assert np.linalg.norm(points - point, axis=1).min() < 1e-6
 
+    # The actions shown are those by which they were.
+    by = np.asarray(env.arm.forward(env.joints(shown)))
+    np.testing.assert_allclose(by, np.where(changed[..., None], goal, reached), atol=2e-6)
+
 
 def test_relabelled_goals_are_as_many_as_transitions(paper_arm: Learnt):
     """Each transition gets a goal of its own."""
     replay = member(paper_arm.after.replay, 0)
     rows = replay.sample(jax.random.key(1), (2, 100))
-    new = paper_arm.agent.relabel(replace(paper_arm.config, her_ratio=1.0), replay, rows, jax.random.key(2))
+    new, _ = paper_arm.agent.relabel(replace(paper_arm.config, her_ratio=1.0), replay, rows, jax.random.key(2))
     goals = goal_in(paper_arm.env, new.obs).reshape(-1, 3)
     assert len(np.unique(goals, axis=0)) > 180
 
@@ -835,8 +865,9 @@ def test_environments_without_goals_are_left_alone():
     agent = DDPG(Walk(), SMALL, num_envs=1, episode_length=10, total_steps=100)
     replay = filled(8, numbered(0, 8))
     rows = replay.sample(jax.random.key(0), (4,))
-    batch = agent.relabel(replace(SMALL, her_ratio=1.0), replay, rows, jax.random.key(1))
+    batch, shown = agent.relabel(replace(SMALL, her_ratio=1.0), replay, rows, jax.random.key(1))
     assert_same_bits(batch, replay.read(rows))
+    assert_same_bits(shown, batch.action)
 
 
 class Button(Toy):
@@ -871,7 +902,8 @@ def test_goals_may_be_those_of_new_episodes():
     training, _ = jax.jit(agent.epoch, static_argnames="steps")(config, agent.init(config, jax.random.key(0)), steps=9)
     replay = training.replay
     rows = replay.sample(jax.random.key(1), (20, 100))
-    old, new = replay.read(rows), agent.relabel(config, replay, rows, jax.random.key(2))
+    old, (new, shown) = replay.read(rows), agent.relabel(config, replay, rows, jax.random.key(2))
+    assert_same_bits(shown, old.action)
     goal = np.asarray(new.obs["state"][..., 1])
     assert len(np.unique(goal)) > 1990, "each transition has its own"
     assert kstest(goal.ravel(), "uniform", (-3, 6)).pvalue > 1e-3, "as `reset` draws them"
@@ -888,7 +920,8 @@ def test_hindsight_recomputes_reward_and_terminal_and_draws_later_goals():
     training, _ = jax.jit(agent.epoch, static_argnames="steps")(config, agent.init(config, jax.random.key(0)), steps=60)
     replay = training.replay
     rows = replay.sample(jax.random.key(1), (2000,))
-    old, new = replay.read(rows), agent.relabel(config, replay, rows, jax.random.key(2))
+    old, (new, shown) = replay.read(rows), agent.relabel(config, replay, rows, jax.random.key(2))
+    assert_same_bits(shown, old.action)
     at, goal = np.asarray(old.next_obs["state"][:, 0]), np.asarray(new.obs["state"][:, 1])
     there = np.abs(at - goal) < 0.3
     np.testing.assert_array_equal(new.terminal, there)
