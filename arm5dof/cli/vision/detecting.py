@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def add_options(p: argparse.ArgumentParser) -> None:
     """Add what says which detector runs, what it is to find, and where that goes."""
     p.add_argument("--detector", type=Path, metavar="MODEL", help="a .pt, .onnx or .npz file; default: what ships")
-    p.add_argument("--names", type=Path, metavar="FILE", help="names of the classes, one a line; default: the model's")
+    p.add_argument("--names", metavar="FILE", help="names of the classes, one a line, or coco; default: the model's")
     p.add_argument("--classes", type=_list, metavar="A,B,...", help="what to look for; default: every class")
     p.add_argument(
         "--confidence", type=float, default=0.25, metavar="P", help="the least confidence, 0 to 1; default 0.25"
@@ -35,6 +35,7 @@ def add_options(p: argparse.ArgumentParser) -> None:
         "--size", type=int, metavar="PIXELS", help="side of the network's input; default: the model's, or 640"
     )
     p.add_argument("--tta", action="store_true", help="test-time augmentation of the shipped detector: twice the time")
+    p.add_argument("--onnxruntime", action="store_true", help="run an .onnx by ONNX Runtime, which is faster for many")
     p.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder for what was found")
 
 
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManage
     failure, total, done, started = None, Counter[str](), 0, time.monotonic()
     with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
         bar.update(0, "reading the detector")
-        detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta)
+        detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta, args.onnxruntime)
         results = detect(source.frames, detector, args.classes)
         bar.update(0, "starting")
         if source.live:  # A camera shall not wait while the program for the first image is compiled.
