@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,14 +46,25 @@ def given(args: argparse.Namespace) -> list[str]:
     return [f"--{name}" for name, default in vars(p.parse_args([])).items() if getattr(args, name) != default]
 
 
-def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManager[list[Write]]) -> int:
+def run(
+    args: argparse.Namespace,
+    source: Source,
+    outputs: AbstractContextManager[list[Write]],
+    named: Sequence[str] = (),
+) -> int:
     """Detect in all frames as the options say and hand each on to the outputs.
+
+    Args:
+        args: The command line.
+        source: Where the frames come from.
+        outputs: Where what was found goes.
+        named: Classes that the command line speaks of, besides those to look for.
 
     Returns:
         The exit status.
 
     Raises:
-        UserError: It cannot go on; what came before is kept.
+        UserError: The detector knows no such class; or it cannot go on, and what came before is kept.
     """
     if args.out is not None and args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
@@ -61,6 +72,7 @@ def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManage
     import numpy as np
 
     from arm5dof.runtime.progress import Bar
+    from arm5dof.vision.detections import check_known
     from arm5dof.vision.detectors.loading import detect, load_detector, read_names
 
     names = None if args.names is None else read_names(args.names)
@@ -68,6 +80,7 @@ def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManage
     with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
         bar.update(0, "reading the detector")
         detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta, args.onnxruntime)
+        check_known(named, detector.class_names)
         results = detect(source.frames, detector, args.classes)
         bar.update(0, "starting")
         if source.live:  # A camera shall not wait while the program for the first image is compiled.

@@ -80,6 +80,11 @@ def load_detector(
     raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt), a network as ONNX (.onnx), or .npz")
 
 
+def is_tabletop(path: str | Path | None) -> bool:
+    """Whether what `load_detector` loads from a file, or without one, is the tabletop detector."""
+    return path is None or (Path(path).is_file() and _kind(Path(path)) == ".npz")
+
+
 def read_names(given: str | Path) -> list[str]:
     """Read names of classes from a text file with one in each line, in the order of their ids.
 
