@@ -41,7 +41,7 @@ and detections.json: a list with an object for each frame, {"name", "time_s", "i
 for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
 
 Faster: a smaller --size. Too little is found: --tta, or a lower --confidence; too much: a higher one. One object is
-found twice: a lower --iou.
+found twice: a lower --iou, of which networks such as YOLOv10 and 26 take no notice.
 
 If an image is damaged, a video breaks off or you press Ctrl-C, the frames before are written and the files are whole;
 the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so there the exit status is 0.

@@ -55,10 +55,11 @@ By two images of the same moment, each with its camera. Objects need not stand o
   arm5dof vision locate left.json right.json --camera left.yml --camera right.yml --height cup=0.045
 
 Printed are millimetres, and standard deviations that follow from those of the cameras, the boxes (--box-std), the depth
-image (--depth-error) and the heights (half a millimetre). With --json: a list of frames, {"name", "objects"}, and in
-that for each detection {"class_name", "confidence", "position", "covariance", "reason"}, metres and square metres in
-the base frame; what cannot be located has null for both, and a reason. Of images there are also each frame's "time_s"
-and "image_size", and each object's "class_id" and "xyxy", as in vision detect.
+image (--depth-error) and the heights (half a millimetre), and from how objects are turned, which no box tells. With
+--json: a list of frames, {"name", "objects"}, and in that for each detection {"class_name", "confidence", "position",
+"covariance", "reason"}, metres and square metres in the base frame; what cannot be located has null for both, and a
+reason. Of images there are also each frame's "time_s" and "image_size", and each object's "class_id" and "xyxy", as in
+vision detect.
 
 With --out a new folder gets positions.json, which is that list, and the images, or the video as MP4, in which each box
 has its class and x, y and z in millimetres, or the reason. An interrupted or damaged source leaves whole files of the
