@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from arm5dof.errors import UserError
+from arm5dof.errors import UserError, nearest
 from arm5dof.vision import boxes
 
 
@@ -145,8 +145,10 @@ def check_known(names: Iterable[str], class_names: Sequence[str]) -> None:
     """Raise `UserError` unless all `names` are among a detector's."""
     for name in names:
         if name not in class_names:
-            known = ", ".join(class_names[:20]) + (", ..." if len(class_names) > 20 else "")
-            raise UserError(f"the detector knows no class {name!r}; it knows: {known}")
+            known = "it knows: " + ", ".join(class_names[:20]) + (", ..." if len(class_names) > 20 else "")
+            near = nearest(name, class_names)
+            hint = known if near is None else f"did you mean {near!r}?"
+            raise UserError(f"the detector knows no class {name!r}; {hint}")
 
 
 def check_thresholds(confidence: float, iou: float) -> None:

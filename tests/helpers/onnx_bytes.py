@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-FLOAT, INT64 = 1, 7
+FLOAT, UINT8, INT64 = 1, 2, 7
 
 NAMES = ("cube", "ball")
 SIZE = 64
@@ -23,9 +23,9 @@ def varint(n: int) -> bytes:
 
 
 def field(number: int, value: int | str | bytes) -> bytes:
-    """One field of a protobuf message."""
+    """One field of a protobuf message; negative numbers are 64 bits long there."""
     if isinstance(value, int):
-        return varint(number << 3) + varint(value)
+        return varint(number << 3) + varint(value % 2**64)
     value = value.encode() if isinstance(value, str) else value
     return varint(number << 3 | 2) + varint(len(value)) + value
 
@@ -41,32 +41,38 @@ def tensor(name: str, array: np.ndarray) -> bytes:
     return field(5, dims + field(2, kind) + field(8, name) + field(9, array.tobytes()))
 
 
-def value(number: int, name: str, shape: tuple[int | str, ...]) -> bytes:
-    dims = b"".join(field(1, field(1, n) if isinstance(n, int) else field(2, n)) for n in shape)
-    return field(number, field(1, name) + field(2, field(1, field(1, FLOAT) + field(2, dims))))
+def value(number: int, name: str, shape: tuple[int | str, ...] | None, kind: int = FLOAT) -> bytes:
+    dims = b"".join(field(1, field(1, n) if isinstance(n, int) else field(2, n)) for n in shape or ())
+    tensor_type = field(1, kind) + (b"" if shape is None else field(2, dims))
+    return field(number, field(1, name) + field(2, field(1, tensor_type)))
 
 
 def constant(
     path: Path,
     output: np.ndarray,
-    shape: tuple[int | str, ...] = (1, 3, "height", "width"),
+    shape: tuple[int | str, ...] | None = (1, 3, "height", "width"),
     metadata: dict[str, str] | None = None,
+    masks: np.ndarray | None = None,
+    kind: int = FLOAT,
 ) -> Path:
-    """A network whose output is `output`, whatever the image of `shape`."""
+    """A network whose output is `output`, and a second one `masks`, whatever the image of `shape`."""
     graph = (
         node("GlobalAveragePool", ["images"], "pooled")
         + node("Reshape", ["pooled", "flat"], "row")
         + node("MatMul", ["row", "zero"], "nothing")
-        + node("Reshape", ["nothing", "one"], "none")
-        + node("Add", ["none", "constant"], "output")
-        + field(2, "constant")
         + tensor("flat", np.array([1, 3], np.int64))
         + tensor("zero", np.zeros((3, 1), np.float32))
-        + tensor("one", np.ones(output.ndim, np.int64))
-        + tensor("constant", output.astype(np.float32))
-        + value(11, "images", shape)
-        + value(12, "output", output.shape)
+        + value(11, "images", shape, kind)
+        + field(2, "constant")
     )
+    for name, array in {"output": output, **({} if masks is None else {"masks": masks})}.items():
+        graph += (
+            node("Reshape", ["nothing", f"{name} one"], f"{name} none")
+            + node("Add", [f"{name} none", f"{name} constant"], name)
+            + tensor(f"{name} one", np.ones(array.ndim, np.int64))
+            + tensor(f"{name} constant", array.astype(np.float32))
+            + value(12, name, array.shape)
+        )
     entries = b"".join(field(14, field(1, k) + field(2, v)) for k, v in (metadata or {}).items())
     path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13)) + entries)
     return path

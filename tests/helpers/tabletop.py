@@ -161,7 +161,7 @@ def detections(boxes: np.ndarray, names: Sequence[str]) -> Detections:
     return Detections(boxes, np.linspace(0.9, 0.5, len(ids)), ids, NAMES)
 
 
-many_boxes = jax.jit(jax.vmap(solid_box, (None, 0, 0, 0, 0)))
+many_boxes = jax.jit(jax.vmap(solid_box, (None, 0, 0, 0, 0, None)))
 
 
 def ideal_boxes(
@@ -170,12 +170,22 @@ def ideal_boxes(
     radii: np.ndarray,
     names: Sequence[str],
     half_heights: Sequence[float] | np.ndarray | None = None,
+    skew: float = 0.0,
 ) -> np.ndarray:
     """The boxes (n, 4) of solids of known width."""
     if half_heights is None:
         half_heights = [SOLIDS[name].half_height for name in names]
     forms = np.array([FORMS[SOLIDS[name].form] for name in names])
-    return np.asarray(many_boxes(camera, centers, radii, np.array(half_heights), forms))
+    return np.asarray(many_boxes(camera, centers, radii, np.array(half_heights), forms, skew))
+
+
+def box_around(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """The box (4,) around points (n, 3) of the base frame, as OpenCV projects them."""
+    rotation, position = np.asarray(camera.rotation), np.asarray(camera.position)
+    turn, _ = cv2.Rodrigues(rotation.T)
+    lens = np.asarray(camera.matrix), np.asarray(camera.distortion)
+    pixels, _ = cv2.projectPoints(points, turn, -rotation.T @ position, *lens)
+    return np.concatenate([pixels[:, 0].min(0), pixels[:, 0].max(0)]) + 0.5
 
 
 def on_the_table(rng: np.random.Generator, names: Sequence[str]) -> np.ndarray:

@@ -25,12 +25,14 @@ The shipped detector finds the objects of our catalogue on a table. MODEL is a f
 
   .pt     YOLOv5's own weights (n, s, m, l, x, release 6 and later), or what was trained from them with that code; run
           in JAX. The file is read without PyTorch, and nothing that it says is run.
-  .onnx   YOLOv5, v7, v8, v11 or YOLOX exported as ONNX, without non-maximum suppression; run by OpenCV.
+  .onnx   YOLOv5, v7, v8, v10, v11, 26 or YOLOX exported as ONNX; run by OpenCV, or with --onnxruntime by ONNX Runtime
+          (pip install 'arm5dof[onnx]'). Of a network that segments the boxes are used.
   .npz    weights of our detector, as arm5dof vision train writes them.
 
   arm5dof vision detect simulated --out found
   arm5dof vision detect bus.jpg --detector yolov5n.pt
   arm5dof vision detect photos/ --detector best.onnx --names classes.txt --out found
+  arm5dof vision detect photos/ --detector yolox_nano.onnx --names coco --onnxruntime
   arm5dof vision detect clip.mp4 --detector yolov5n.pt --classes person,bus --out found
   arm5dof vision detect 0 --detector yolov5n.pt --size 320 --out found       until Ctrl-C
 
@@ -39,7 +41,7 @@ and detections.json: a list with an object for each frame, {"name", "time_s", "i
 for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
 
 Faster: a smaller --size. Too little is found: --tta, or a lower --confidence; too much: a higher one. One object is
-found twice: a lower --iou.
+found twice: a lower --iou, of which networks such as YOLOv10 and 26 take no notice.
 
 If an image is damaged, a video breaks off or you press Ctrl-C, the frames before are written and the files are whole;
 the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so there the exit status is 0.

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def add_options(p: argparse.ArgumentParser) -> None:
     """Add what says which detector runs, what it is to find, and where that goes."""
     p.add_argument("--detector", type=Path, metavar="MODEL", help="a .pt, .onnx or .npz file; default: what ships")
-    p.add_argument("--names", type=Path, metavar="FILE", help="names of the classes, one a line; default: the model's")
+    p.add_argument("--names", metavar="FILE", help="names of the classes, one a line, or coco; default: the model's")
     p.add_argument("--classes", type=_list, metavar="A,B,...", help="what to look for; default: every class")
     p.add_argument(
         "--confidence", type=float, default=0.25, metavar="P", help="the least confidence, 0 to 1; default 0.25"
@@ -35,6 +35,7 @@ def add_options(p: argparse.ArgumentParser) -> None:
         "--size", type=int, metavar="PIXELS", help="side of the network's input; default: the model's, or 640"
     )
     p.add_argument("--tta", action="store_true", help="test-time augmentation of the shipped detector: twice the time")
+    p.add_argument("--onnxruntime", action="store_true", help="run an .onnx by ONNX Runtime, which is faster for many")
     p.add_argument("--out", type=Path, metavar="FOLDER", help="a new folder for what was found")
 
 
@@ -45,14 +46,25 @@ def given(args: argparse.Namespace) -> list[str]:
     return [f"--{name}" for name, default in vars(p.parse_args([])).items() if getattr(args, name) != default]
 
 
-def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManager[list[Write]]) -> int:
+def run(
+    args: argparse.Namespace,
+    source: Source,
+    outputs: AbstractContextManager[list[Write]],
+    named: Sequence[str] = (),
+) -> int:
     """Detect in all frames as the options say and hand each on to the outputs.
+
+    Args:
+        args: The command line.
+        source: Where the frames come from.
+        outputs: Where what was found goes.
+        named: Classes that the command line speaks of, besides those to look for.
 
     Returns:
         The exit status.
 
     Raises:
-        UserError: It cannot go on; what came before is kept.
+        UserError: The detector knows no such class; or it cannot go on, and what came before is kept.
     """
     if args.out is not None and args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
@@ -60,13 +72,15 @@ def run(args: argparse.Namespace, source: Source, outputs: AbstractContextManage
     import numpy as np
 
     from arm5dof.runtime.progress import Bar
+    from arm5dof.vision.detections import check_known
     from arm5dof.vision.detectors.loading import detect, load_detector, read_names
 
     names = None if args.names is None else read_names(args.names)
     failure, total, done, started = None, Counter[str](), 0, time.monotonic()
     with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
         bar.update(0, "reading the detector")
-        detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta)
+        detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta, args.onnxruntime)
+        check_known(named, detector.class_names)
         results = detect(source.frames, detector, args.classes)
         bar.update(0, "starting")
         if source.live:  # A camera shall not wait while the program for the first image is compiled.

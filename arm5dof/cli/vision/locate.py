@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import detecting
-from arm5dof.errors import UserError
+from arm5dof.errors import UserError, nearest
 from arm5dof.runtime import files
 
 if TYPE_CHECKING:
@@ -55,10 +55,11 @@ By two images of the same moment, each with its camera. Objects need not stand o
   arm5dof vision locate left.json right.json --camera left.yml --camera right.yml --height cup=0.045
 
 Printed are millimetres, and standard deviations that follow from those of the cameras, the boxes (--box-std), the depth
-image (--depth-error) and the heights (half a millimetre). With --json: a list of frames, {"name", "objects"}, and in
-that for each detection {"class_name", "confidence", "position", "covariance", "reason"}, metres and square metres in
-the base frame; what cannot be located has null for both, and a reason. Of images there are also each frame's "time_s"
-and "image_size", and each object's "class_id" and "xyxy", as in vision detect.
+image (--depth-error) and the heights (half a millimetre), and from how objects are turned, which no box tells. With
+--json: a list of frames, {"name", "objects"}, and in that for each detection {"class_name", "confidence", "position",
+"covariance", "reason"}, metres and square metres in the base frame; what cannot be located has null for both, and a
+reason. Of images there are also each frame's "time_s" and "image_size", and each object's "class_id" and "xyxy", as in
+vision detect.
 
 With --out a new folder gets positions.json, which is that list, and the images, or the video as MP4, in which each box
 has its class and x, y and z in millimetres, or the reason. An interrupted or damaged source leaves whole files of the
@@ -131,6 +132,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
 
 def _run_on_images(args: argparse.Namespace) -> int:
     """Detect in images, and locate what is found."""
+    from arm5dof.vision.detectors.loading import is_tabletop
     from arm5dof.vision.io.sources import open_source
 
     source = open_source(args.source)
@@ -142,13 +144,16 @@ def _run_on_images(args: argparse.Namespace) -> int:
     if args.depth and source.length != 1:
         raise UserError(f"{args.depth} is the depth image of one frame: give the one image that goes with it")
     cameras, locate = _load_cameras(args.camera, args.hand), _locator(args)
+    if is_tabletop(args.detector):
+        _warn_of_viewpoint(cameras, args.table)
 
     def place(frame: Frame, found: Detections) -> Localization:
         camera = frame.camera or cameras[0]
         _check_size(frame.name, frame.image.shape[1::-1], camera)
         return locate(found, camera)
 
-    return detecting.run(args, source, _outputs(args.out, args.json, source, place))
+    named = [name for name, *_ in args.height]
+    return detecting.run(args, source, _outputs(args.out, args.json, source, place), named)
 
 
 @contextmanager
@@ -191,11 +196,16 @@ def _run_on_lists(args: argparse.Namespace) -> int:
     if args.depth and len(moments) != 1:
         raise UserError(f"{args.depth} is the depth image of one frame, and {args.source[0]} has {len(moments)}")
     locate = _locator(args)
+    _note_unseen(
+        [name for name, *_ in args.height], {name for _, views in moments for v in views for name in v.class_names}
+    )
     with Bar("locating", len(moments), "frames") as bar:
         bar.update(0, "starting")
         for name, found in moments:
             answers.append((name, locate(found, cameras)))
             bar.update(len(answers), name or "")
+    if not args.height:
+        _warn_of_viewpoint(cameras, args.table)
     if args.json:
         print(files.to_json([localizations.as_json(*answer) for answer in answers]))
     else:
@@ -261,6 +271,26 @@ def _read_moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tupl
                 _check_size(frame.name, frame.size, camera)
     moments = zip(*views, strict=True)
     return [(" + ".join(f.name for f in m if f.name) or None, [f.detections for f in m]) for m in moments]
+
+
+def _warn_of_viewpoint(cameras: Sequence[Camera], table_height: float) -> None:
+    """Say where the shipped detector, and whatever else was trained as it was, is out of its depth."""
+    from arm5dof.vision.detectors.tabletop.viewpoint import unlike_training
+
+    for camera in cameras:
+        if camera.has_extrinsics and (unusual := unlike_training(camera, table_height)):
+            print(
+                "arm5dof: the shipped detector is for cameras 0.5 to 1 m from the table, at least 30 degrees above it, "
+                f"not rolled, and this one is {unusual}: do not trust what is found",
+                file=sys.stderr,
+            )
+
+
+def _note_unseen(named: Sequence[str], seen: set[str]) -> None:
+    """Say which classes of known height are not seen while one of a similar name is, of which none is known."""
+    for name in named:
+        if name not in seen and (near := nearest(name, seen.difference(named))):
+            print(f"arm5dof: --height {name}: no {name} was detected; did you mean {near!r}?", file=sys.stderr)
 
 
 def _check_size(name: str | None, size: tuple[int, ...], camera: Camera) -> None:

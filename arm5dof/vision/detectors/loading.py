@@ -14,6 +14,7 @@ from pathlib import Path
 
 from arm5dof.errors import UserError
 from arm5dof.vision.detections import Detections, Detector, check_known
+from arm5dof.vision.detectors.coco import COCO
 from arm5dof.vision.frames import Frame
 
 
@@ -24,6 +25,7 @@ def load_detector(
     iou: float = 0.45,
     size: int | None = None,
     tta: bool = False,
+    onnxruntime: bool = False,
 ) -> Detector:
     """Load the detector in a file, or the one that ships.
 
@@ -31,12 +33,14 @@ def load_detector(
         path: YOLOv5's own weights (`.pt`), a network of the YOLO family as ONNX (`.onnx`), or weights of the tabletop
             detector (`.npz`). A file with another suffix is recognized by its content. None for the tabletop detector
             that ships.
-        class_names: Names of the network's classes; None for those in the file.
+        class_names: Names of the network's classes, such as `COCO`; None for those in the file.
         confidence: Detections below it are dropped, in [0, 1].
-        iou: Of boxes of one class that overlap more, the best stays, in [0, 1].
+        iou: Of boxes of one class that overlap more, the best stays, in [0, 1]; networks that choose for themselves,
+            such as YOLOv10 and 26, take no notice.
         size: Side of the network's input, pixels; None for the file's, or 640 where that leaves it open.
         tta: Test-time augmentation: see `TabletopDetector`, which alone has it, and which takes neither class names nor
             a size.
+        onnxruntime: Run an `.onnx` file by ONNX Runtime (`pip install 'arm5dof[onnx]'`) and not by OpenCV.
 
     Returns:
         A function from an RGB image to `Detections`.
@@ -51,8 +55,13 @@ def load_detector(
     """
     if path is not None and not Path(path).is_file():
         raise UserError(f"no detector {str(path)!r}: give a .pt, .onnx or .npz file")
+    kind = ".npz" if path is None else _kind(Path(path))
+    if isinstance(class_names, str):
+        raise UserError(f"class_names is a list with the name of each class, not one text: {class_names[:40]!r}")
     # Each takes its second to import, and only one is needed.
-    if path is None or (kind := _kind(Path(path))) == ".npz":
+    if onnxruntime and kind != ".onnx":
+        raise UserError("ONNX Runtime runs .onnx files only: give one, or leave onnxruntime out")
+    if path is None or kind == ".npz":
         from arm5dof.vision.detectors.tabletop.detector import TabletopDetector
 
         if class_names is not None or size is not None:
@@ -67,16 +76,27 @@ def load_detector(
     if kind == ".onnx":
         from arm5dof.vision.detectors.yolo_onnx import OnnxYOLO
 
-        return OnnxYOLO(path, class_names, confidence, iou, size)
+        return OnnxYOLO(path, class_names, confidence, iou, size, onnxruntime)
     raise UserError(f"{path} is no detector: give YOLOv5's weights (.pt), a network as ONNX (.onnx), or .npz")
 
 
-def read_names(path: Path) -> list[str]:
+def is_tabletop(path: str | Path | None) -> bool:
+    """Whether what `load_detector` loads from a file, or without one, is the tabletop detector."""
+    return path is None or (Path(path).is_file() and _kind(Path(path)) == ".npz")
+
+
+def read_names(given: str | Path) -> list[str]:
     """Read names of classes from a text file with one in each line, in the order of their ids.
+
+    Args:
+        given: The file; or `coco`, for the 80 classes of COCO. A file of that name is `./coco`.
 
     Raises:
         UserError: There is no such file, it is no text, or a line of it is empty.
     """
+    if given == "coco":
+        return list(COCO)
+    path = Path(given)
     try:
         names = path.read_text(encoding="utf-8-sig").strip().splitlines()
     except OSError as error:

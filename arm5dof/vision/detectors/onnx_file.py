@@ -1,4 +1,4 @@
-"""What an ONNX file says of itself: the shapes of its inputs and its metadata.
+"""What an ONNX file says of itself: its inputs and its metadata.
 
 The file is one protobuf message. The few fields needed are read by their numbers in onnx.proto, without a library.
 """
@@ -15,19 +15,31 @@ MODEL_GRAPH, MODEL_METADATA = 7, 14
 GRAPH_INITIALIZER, GRAPH_INPUT = 5, 11
 TENSOR_NAME = 8
 VALUE_NAME, VALUE_TYPE = 1, 2
-TYPE_TENSOR, TENSOR_SHAPE, SHAPE_DIM, DIM_VALUE = 1, 2, 1, 1
+TYPE_TENSOR, TENSOR_KIND, TENSOR_SHAPE, SHAPE_DIM, DIM_VALUE = 1, 1, 2, 1, 1
 ENTRY_KEY, ENTRY_VALUE = 1, 2
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 """Protobuf's wire types."""
+
+MAX_LENGTH = 2**31
+"""Of a dimension; a negative number, which leaves it open, is a number of 64 bits without its sign."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """A tensor that a network takes."""
+
+    shape: tuple[int | None, ...] | None
+    """None where the file leaves a length open, or even how many there are."""
+    kind: int
+    """Of its numbers, as onnx.proto counts them: 1 is float32, 10 float16."""
 
 
 @dataclass(frozen=True)
 class Description:
     """What an ONNX file says of its network."""
 
-    inputs: tuple[tuple[int | None, ...], ...]
-    """Shapes; None where the file leaves a length open."""
+    inputs: tuple[Input, ...]
     metadata: dict[str, str]
     """What its exporter wrote, such as the names of the classes."""
 
@@ -55,23 +67,30 @@ def _model(message: memoryview) -> Description:
     inputs = [v for v in _submessages(graphs[0], GRAPH_INPUT) if _text(v, VALUE_NAME) not in constants]
     entries = _submessages(message, MODEL_METADATA)
     return Description(
-        tuple(_shape(value) for value in inputs), {_text(e, ENTRY_KEY): _text(e, ENTRY_VALUE) for e in entries}
+        tuple(_input(value) for value in inputs), {_text(e, ENTRY_KEY): _text(e, ENTRY_VALUE) for e in entries}
     )
 
 
-def _shape(value: memoryview) -> tuple[int | None, ...]:
-    for number in (VALUE_TYPE, TYPE_TENSOR, TENSOR_SHAPE):
+def _input(value: memoryview) -> Input:
+    for number in (VALUE_TYPE, TYPE_TENSOR):
         found = _submessages(value, number)
         if len(found) != 1:
             raise ValueError("an input is no tensor")
         value = found[0]
-    lengths = [[n for number, n in _fields(dim) if number == DIM_VALUE] for dim in _submessages(value, SHAPE_DIM)]
-    return tuple(n[0] if n and isinstance(n[0], int) and n[0] > 0 else None for n in lengths)
+    kinds, shapes = _numbers(value, TENSOR_KIND), _submessages(value, TENSOR_SHAPE)
+    lengths = [_numbers(dim, DIM_VALUE) for shape in shapes[:1] for dim in _submessages(shape, SHAPE_DIM)]
+    shape = tuple(n[0] if n and 0 < n[0] < MAX_LENGTH else None for n in lengths)
+    return Input(shape if shapes else None, kinds[0] if kinds else 0)
 
 
 def _text(message: memoryview, number: int) -> str:
     found = _submessages(message, number)
     return bytes(found[0]).decode() if found else ""
+
+
+def _numbers(message: memoryview, number: int) -> list[int]:
+    """Every field of that number that is a number."""
+    return [value for n, value in _fields(message) if n == number and isinstance(value, int)]
 
 
 def _submessages(message: memoryview, number: int) -> list[memoryview]:

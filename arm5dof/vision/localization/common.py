@@ -171,6 +171,21 @@ def detection_problems(detections: Detections, camera: Camera, solids: Solids, c
     ]
 
 
+def size_problems(
+    boxes: np.ndarray, names: np.ndarray, camera: Camera, solids: Solids, position: np.ndarray
+) -> list[Problem]:
+    """Boxes (n, 4) in a camera's image that are larger or smaller than those of solids can be where they are, (n, 3),
+    metres, base frame."""
+    known = [solids.get(name) for name in names]
+    low, high = np.array([each.sizes if isinstance(each, Solid) else (0, np.inf) for each in known]).reshape(-1, 2).T
+    depth = (position - camera.position) @ np.asarray(camera.rotation)[:, 2]
+    size = (boxes[:, 2:] - boxes[:, :2]).max(1) * depth / camera.matrix[0, 0]
+    return [
+        (size > high, "its box is larger than that of any {name}"),
+        (size < low, "its box is smaller than that of any {name}"),
+    ]
+
+
 def within_distance(nearest: float, farthest: float) -> Workspace:
     """A workspace between two spheres round the origin of the base frame, which is the arm's.
 

@@ -26,6 +26,7 @@ from arm5dof.vision.localization.common import (
     batched,
     check_inputs,
     detection_problems,
+    size_problems,
 )
 from arm5dof.vision.localization.solids import FORMS, axes
 from arm5dof.vision.localization.table_plane import on_plane
@@ -94,6 +95,7 @@ def by_depth(
     problems = [
         *detection_problems(detections, camera, solids),
         (~(share > MIN_SHARE), "the depth image shows too little of it"),
+        *size_problems(detections.xyxy, detections.data["class_name"], camera, solids, position),
     ]
     return Localization.of(detections, position, covariance, problems, workspace)
 

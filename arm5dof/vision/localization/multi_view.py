@@ -13,7 +13,14 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Array, Camera
 from arm5dof.vision.detections import Detections
-from arm5dof.vision.localization.box_fit import box_center, camera_errors, fit_box, independent, propagate
+from arm5dof.vision.localization.box_fit import (
+    SKEW_STD,
+    box_center,
+    camera_errors,
+    fit_box,
+    independent,
+    propagate,
+)
 from arm5dof.vision.localization.common import (
     MAX_RMS,
     NOTHING_SEEN,
@@ -24,6 +31,7 @@ from arm5dof.vision.localization.common import (
     batched,
     check_inputs,
     detection_problems,
+    size_problems,
 )
 
 MIN_SINE = np.sin(np.deg2rad(3))
@@ -83,6 +91,11 @@ def by_views(
         (np.isnan(sine), NOTHING_SEEN),
         (sine < MIN_SINE, "the cameras see it from one side, and its distance is open"),
         (~(same_class & (depth > 0) & (rms < MAX_RMS * box_std)), "no one {name} explains its boxes"),
+        *(
+            problem
+            for i, camera in enumerate(cameras)
+            for problem in size_problems(boxes[:, i], names[:, i], camera, solids, position)
+        ),
     ]
     return Localization.of(first, position, covariance, problems, workspace)
 
@@ -97,14 +110,17 @@ def _by_views(objects: ObjectBatch, cameras: tuple[Camera, ...], box_std: float)
         sine = jnp.stack([jnp.linalg.norm(jnp.cross(a, b)) for a, b in combinations(rays, 2)]).max()
         start = _nearest(cameras, rays)
 
-        def estimate(boxes: jax.Array, half_height: jax.Array, *errors: jax.Array) -> tuple[jax.Array, Any]:
+        def estimate(
+            boxes: jax.Array, half_height: jax.Array, skew: jax.Array, *errors: jax.Array
+        ) -> tuple[jax.Array, Any]:
             true = [camera.perturbed(error) for camera, error in zip(cameras, errors, strict=True)]
-            fit = fit_box(true, boxes.reshape(-1, 4), half_height[0], seen.form, start, None, box_std)
+            fit = fit_box(true, boxes.reshape(-1, 4), half_height[0], seen.form, start, None, box_std, skew=skew)
             return fit.center, (fit.center, fit.reprojection_rms)
 
         inputs = [
             independent(seen.boxes.ravel(), box_std),
             independent(seen.half_height[None], seen.std),
+            independent(jnp.zeros(len(cameras)), SKEW_STD),
             *map(camera_errors, cameras),
         ]
         covariance, (center, rms) = propagate(estimate, inputs)

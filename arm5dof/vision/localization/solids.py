@@ -40,6 +40,8 @@ class Solid:
     such as a ball or an egg. `cone`: pointed, such as a cone or a pyramid."""
     std: float = 5e-4
     """Standard deviation of the half height, metres."""
+    sizes: tuple[float, float] = (0.0, math.inf)
+    """The least and the most that the longer side of a box around it can measure, where it stands, metres."""
 
     def __post_init__(self) -> None:
         if self.form not in FORMS:
@@ -48,7 +50,11 @@ class Solid:
             raise UserError(f"a half height of {self.half_height:g} +- {self.std:g} m: give metres above zero")
 
 
-CATALOGUE_SOLIDS = {each.name: Solid(each.half_height, each.form) for each in CATALOGUE}
+CATALOGUE_SIZES = (0.4 * 0.02, 1.4 * max(2 * math.hypot(each.radius, each.half_height) for each in CATALOGUE))
+"""Of boxes around objects of the catalogue: from two fifths of what is as wide as the least of them, the rest being
+hidden, to all of the largest, for which a box near the image's edge is too large."""
+
+CATALOGUE_SOLIDS = {each.name: Solid(each.half_height, each.form, sizes=CATALOGUE_SIZES) for each in CATALOGUE}
 """What is known of the objects of the catalogue, by the names of their classes."""
 
 
@@ -59,7 +65,9 @@ def axes(camera: Camera) -> jax.Array:
     return jnp.stack([x, y, 0 * x, -y, x, 0 * x, 0 * x, 0 * x, 0 * x + 1]).reshape(3, 3)
 
 
-def solid_box(camera: Camera, center: Array, radii: Array, half_height: Array, form: Array) -> jax.Array:
+def solid_box(
+    camera: Camera, center: Array, radii: Array, half_height: Array, form: Array, skew: Array | float = 0.0
+) -> jax.Array:
     """The box around a solid in the image.
 
     Args:
@@ -68,6 +76,8 @@ def solid_box(camera: Camera, center: Array, radii: Array, half_height: Array, f
         radii: Half its width along the camera's horizontal `axes`, (2,), metres.
         half_height: (), metres.
         form: One of `FORMS`, (2, 3).
+        skew: How far behind its center it is widest on the right, and before it on the left, as a share of half its
+            depth, (), in (-1, 1): zero only for what stands along or across those axes.
 
     Returns:
         Left, top, right and bottom edges, (4,), pixels, pixel i covering [i, i + 1); NaN if the solid is not all in
@@ -76,7 +86,8 @@ def solid_box(camera: Camera, center: Array, radii: Array, half_height: Array, f
     directions = axes(camera)
     centers = camera.to_camera(center + half_height * form[:, :1] * directions[2])
     sizes = jnp.concatenate([radii * form[:, 1:2], half_height * form[:, 2:]], axis=1)
-    semiaxes = sizes[:, :, None] * (directions @ camera.rotation)
+    wide, deep, high = jnp.moveaxis(sizes[:, :, None] * (directions @ camera.rotation), 1, 0)
+    semiaxes = jnp.stack([wide + skew * deep, jnp.sqrt(1 - jnp.square(skew)) * deep, high], axis=1)
     shapes = semiaxes.transpose(0, 2, 1) @ semiaxes
     (left, right), (top, bottom) = (jax.vmap(partial(_touching, axis), out_axes=1)(centers, shapes) for axis in (0, 1))
     touching = jnp.stack([left, top, right, bottom])

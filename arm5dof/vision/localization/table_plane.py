@@ -12,6 +12,7 @@ from arm5dof.vision.camera import Array, Camera
 from arm5dof.vision.detections import Detections
 from arm5dof.vision.localization.box_fit import (
     ELONGATION_STD,
+    SKEW_STD,
     box_center,
     camera_errors,
     fit_box,
@@ -29,6 +30,7 @@ from arm5dof.vision.localization.common import (
     check_inputs,
     cut_edges,
     detection_problems,
+    size_problems,
 )
 
 MIN_SINE = np.sin(np.deg2rad(5))
@@ -73,6 +75,7 @@ def by_plane(
         (np.isnan(sine), NOTHING_SEEN),
         (sine < MIN_SINE, "the line of sight does not meet the table"),
         (~(rms < MAX_RMS * box_std), "nothing of the height of {name} on the table explains its box"),
+        *size_problems(detections.xyxy, detections.data["class_name"], camera, solids, position),
     ]
     return Localization.of(detections, position, covariance, problems, workspace)
 
@@ -87,11 +90,11 @@ def _by_plane(objects: ObjectBatch, camera: Camera, table_height: float, box_std
         known = None if seen.known is None else seen.known[None]
 
         def estimate(
-            box: jax.Array, error: jax.Array, half_height: jax.Array, *unlike: jax.Array
+            box: jax.Array, error: jax.Array, half_height: jax.Array, skew: jax.Array, *unlike: jax.Array
         ) -> tuple[jax.Array, Any]:
             cameras, elongation = [camera.perturbed(error)], unlike[0][0] if unlike else 0.0
             fit = fit_box(
-                cameras, box[None], half_height[0], seen.form, start, table_height, box_std, known, elongation
+                cameras, box[None], half_height[0], seen.form, start, table_height, box_std, known, elongation, skew
             )
             return fit.center, (fit.center, fit.reprojection_rms)
 
@@ -99,6 +102,7 @@ def _by_plane(objects: ObjectBatch, camera: Camera, table_height: float, box_std
             independent(seen.boxes, box_std),
             camera_errors(camera),
             independent(seen.half_height[None], seen.std),
+            independent(jnp.zeros(1), SKEW_STD),
         ]
         if known is not None:
             inputs.append(independent(jnp.zeros(1), ELONGATION_STD))

@@ -161,6 +161,15 @@ def test_for_people(folder, capsys):
     assert "does not say how well the camera is known" in err and err.count("\n") == 1
 
 
+def test_a_height_that_no_detection_has_but_for_a_letter(folder, capsys):
+    """The file does not tell what the detector knows, so that it may be meant."""
+    words = [folder / "list.json", "--camera", folder / "posed.yml", "--height"]
+    assert command(*words, "cubes=0.015", "--height", "ball=0.018") == 0
+    assert "no cubes was detected; did you mean 'cube'?" in capsys.readouterr().err
+    assert command(*words, "cubes=0.015", "--height", "cube=0.015") == 0
+    assert not capsys.readouterr().err
+
+
 def test_bad_input_is_one_line(folder, tmp_path, capfd):
     for name, text in {
         "words": "hello",

@@ -74,6 +74,25 @@ def errors(objects, there):
     ]
 
 
+def test_heights_of_classes_that_the_detector_does_not_have(small, tmp_path, capsys):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((SIZE, SIZE, 3), np.uint8))
+    for name, hint in (("bal", "did you mean 'ball'?"), ("orange", "it knows: cube, ball")):
+        assert command(tmp_path / "a.png", *small, "--height", f"{name}=0.03") == 2
+        said = capsys.readouterr()
+        assert said.err == f"arm5dof: the detector knows no class {name!r}; {hint}\n" and not said.out
+
+
+def test_a_camera_that_the_shipped_detector_is_not_for(shots, photo, capsys):
+    """Rolled by a quarter turn. A detector of one's own is asked no such thing."""
+    camera = shots[1].camera
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    camera.replace(rotation=camera.rotation @ quarter, covariance=KNOWN).save(photo.parent / "rolled.yml")
+    for words, warned in ((["rolled.yml"], True), (["posed.yml"], False)):
+        assert command(photo, "--camera", photo.parent / words[0], "--classes", "ring") == 0
+        said = capsys.readouterr().err
+        assert ("the shipped detector is for cameras 0.5 to 1 m" in said and "rolled by" in said) == warned, said
+
+
 def test_random_scenes(shots, tmp_path, capsys):
     frames = told(capsys, f"simulated:{SCENES}", "--out", tmp_path / "placed")
     assert frames == json.loads((tmp_path / "placed" / "positions.json").read_text())

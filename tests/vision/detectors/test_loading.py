@@ -44,6 +44,21 @@ def test_only_the_tabletop_detector_has_test_time_augmentation(tmp_path):
         load_detector(tmp_path / "other.onnx", tta=True)
 
 
+def test_only_onnx_files_are_run_by_onnx_runtime(tabletop, tmp_path):
+    for path in (None, tabletop, Architecture(4, 1, 2).save(tmp_path / "x.pt")):
+        with pytest.raises(UserError, match=r"runs \.onnx files only"):
+            load_detector(path, onnxruntime=True)
+
+
+def test_the_names_of_coco(test_data):
+    assert read_names("coco") == list(load_detector(test_data / "vision" / "models" / "yolov5n.pt").class_names)
+
+
+def test_names_are_no_text(model):
+    with pytest.raises(UserError, match="not one text: 'coco'"):
+        load_detector(model, "coco")
+
+
 def test_classes_and_names(tmp_path):
     path = constant(tmp_path / "x.onnx", output("yolov8"), (1, 3, SIZE, SIZE))
     (tmp_path / "names.txt").write_text("\ufeffcup\r\nred ball\r\n\r\n", encoding="utf-8")

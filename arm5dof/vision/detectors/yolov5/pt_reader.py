@@ -49,14 +49,18 @@ DTYPES = {
 MODULES = ("models.", "torch.nn.modules.")
 """Modules whose classes become shells."""
 
-IGNORED = (
-    ("numpy.core.multiarray", "scalar"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("_codecs", "encode"),
-    ("torch", "Size"),
-    ("torch", "device"),
+IGNORED = frozenset(
+    (module, name)
+    for modules, names in (
+        (("numpy.core.multiarray", "numpy._core.multiarray"), ("scalar", "_reconstruct")),  # Before NumPy 2, and since.
+        (("numpy",), ("ndarray", "dtype")),
+        (("_codecs",), ("encode",)),
+        (("pathlib", "pathlib._local"), ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")),
+        (("argparse",), ("Namespace",)),
+        (("torch",), ("Size", "device")),
+    )
+    for module in modules
+    for name in names
 )
 """Names in files with the training's records: they are accepted, and what they would make is not made."""
 

@@ -1,5 +1,7 @@
 """PyTorch's files are read without PyTorch, and nothing that they ask for is done."""
 
+import argparse
+import pathlib
 import pickle
 import pickletools
 import sys
@@ -12,6 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from arm5dof.errors import UserError
+from arm5dof.vision import images
+from arm5dof.vision.detectors.yolov5.model import YOLOv5
 from arm5dof.vision.detectors.yolov5.pt_reader import OPCODES, read_pt
 
 
@@ -127,11 +131,32 @@ def test_those_pickles_would_have_run(tmp_path):
         marker.unlink()
 
 
-def test_harmless_shells_are_all_that_is_left_of_training_records(tmp_path):
-    dtype = Raw(named("numpy", "dtype") + Writer().write(("f8", False, True)) + b"R" + Writer().write((3, "<")) + b"b")
-    value = Raw(named("numpy.core.multiarray", "scalar") + b"(" + dtype + Writer().write("8 bytes") + b"tR")
-    loaded = read_pt(save(tmp_path / "x.pt", {"best_fitness": value, "epoch": 3}))
-    assert loaded["epoch"] == 3 and not isinstance(loaded["best_fitness"], np.generic)
+RECORDS = {
+    "scalar": np.float64(0.7),
+    "array": np.arange(3.0),
+    "pure path": pathlib.PurePosixPath("runs/mine.yaml"),
+    "path": pathlib.Path("runs/mine.yaml"),
+    "options": argparse.Namespace(epochs=300, data=pathlib.Path("mine.yaml")),
+}
+
+
+@pytest.mark.parametrize("numpy", [b"numpy.core.", b"numpy._core."])
+@pytest.mark.parametrize("name", RECORDS)
+def test_harmless_shells_are_all_that_is_left_of_training_records(tmp_path, name, numpy):
+    """As Python's own pickle writes them, in the protocol that PyTorch uses, whatever wrote the file."""
+    text = pickle.dumps(RECORDS[name], 2)[2:-1].replace(b"numpy._core.", numpy)
+    loaded = read_pt(save(tmp_path / "x.pt", {"best_fitness": Raw(text), "epoch": 3}))
+    assert loaded["epoch"] == 3 and type(loaded["best_fitness"]).__module__ == read_pt.__module__
+    if name == "path":
+        text = text.replace(b"PosixPath", b"WindowsPath").replace(b"pathlib\n", b"pathlib._local\n")
+        assert read_pt(save(tmp_path / "x.pt", {"best_fitness": Raw(text), "epoch": 3}))["epoch"] == 3
+
+
+@pytest.mark.parametrize("name", ["posix", "windows", "numpy2_scalar", "numpy2_array"])
+def test_files_with_records_of_todays_training(test_data, name):
+    folder = test_data / "faults/15-yolov5-pt"
+    detector = YOLOv5(folder / f"{name}.pt", size=64)
+    assert detector.class_names == ("cup", "nut") and len(detector(images.read(folder / "img.png")))
 
 
 @pytest.mark.parametrize(
