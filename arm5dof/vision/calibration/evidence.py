@@ -14,7 +14,7 @@ import numpy as np
 
 TWO_CAMERAS = 40.0
 """F-statistic of two cameras against one from which on there are two. The most favourable division of OpenCV's
-photographs, all or some, reaches 23, of drawn ones of one camera 5; with cameras 2 % apart it is 60 and more."""
+photographs, all or some, reaches 23, of drawn ones of one camera 6; with cameras 2 % apart it is 60 and more."""
 
 MANY = 20
 """From so many views on the threshold grows with their number, as that statistic does for views of one camera: the more
