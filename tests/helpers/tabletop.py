@@ -51,9 +51,11 @@ def camera_at(matrix: np.ndarray, lens: tuple[np.ndarray, np.ndarray] = LENS) ->
     return Camera(*lens, matrix[:3, :3], matrix[:3, 3], WIDTH, HEIGHT)
 
 
-def corners(rng: np.random.Generator, board: np.ndarray, noise: float = 0.2) -> Corners:
-    """The board's corners as the true lens shows them, off by `noise` pixels."""
-    pixels, _ = cv2.projectPoints(BOARD.points, cv2.Rodrigues(board[:3, :3])[0], board[:3, 3], *LENS)
+def corners(
+    rng: np.random.Generator, board: np.ndarray, noise: float = 0.2, lens: tuple[np.ndarray, np.ndarray] = LENS
+) -> Corners:
+    """The board's corners as a lens shows them, off by `noise` pixels."""
+    pixels, _ = cv2.projectPoints(BOARD.points, cv2.Rodrigues(board[:3, :3])[0], board[:3, 3], *lens)
     return Corners(BOARD.points, (pixels[:, 0] + noise * rng.normal(size=(54, 2))).astype(np.float32))
 
 

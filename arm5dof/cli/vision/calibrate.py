@@ -85,12 +85,13 @@ def calibration_table(views: BoardViews, result: Calibration) -> str:
     """What a calibration found, for people."""
     from arm5dof.vision.calibration.intrinsics import INTRINSICS
 
-    width = max(len(name) for name in [*result.errors, *result.outliers, *views.without, "photograph"])
+    width = max(len(name) for name in [*result.errors, *result.outliers, *result.copies, *views.without, "photograph"])
     lines = [f"{'photograph':{width}}  error, pixels"]
     lines += [f"{name:{width}}  {error:.3f}" for name, error in result.errors.items()]
     lines += [
         f"{name:{width}}  {error:.3f}  left out: does not fit the others" for name, error in result.outliers.items()
     ]
+    lines += [f"{name:{width}}  -      left out: the same as {first}" for name, first in result.copies.items()]
     lines += [f"{name:{width}}  -      left out: board not found" for name in views.without]
     lines += ["", f"{'intrinsic':{width}}  value +- standard deviation"]
     for name, value, deviation in zip(INTRINSICS, result.intrinsics, result.deviations, strict=False):
@@ -114,5 +115,6 @@ def as_json(views: BoardViews, result: Calibration) -> dict[str, Any]:
         },
         "errors_px": result.errors,
         "outliers_px": result.outliers,
+        "copies": result.copies,
         "without_board": views.without,
     }

@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 
 from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.calibration.evidence import evidence, intrinsics_covariance
 from arm5dof.vision.camera import Camera
 
 
 def add_intrinsics_covariance(camera: Camera, views: Sequence[Corners], boards: Sequence[np.ndarray]) -> Camera:
-    """The covariance of a camera's intrinsics.
+    """The covariance of a camera's intrinsics, by how far the views disagree.
 
     Args:
         camera: It was calibrated from the views.
@@ -26,18 +27,9 @@ def add_intrinsics_covariance(camera: Camera, views: Sequence[Corners], boards: 
     Returns:
         The camera with a covariance; that of its pose is zero.
     """
-    size = 4 + len(camera.distortion)
-    information, squares, spare = np.zeros((size, size)), 0.0, -size
-    for corners, board in zip(views, boards, strict=True):
-        residual, jacobian = linearize(camera, corners, board)
-        lens, pose = np.split(jacobian, [size], axis=1)
-        # What of an error in the intrinsics the board's pose cannot make good.
-        left = lens - pose @ np.linalg.lstsq(pose, lens, rcond=None)[0]
-        information += left.T @ left
-        squares += residual @ residual
-        spare += len(residual) - 6
-    covariance = np.zeros((size + 6, size + 6))
-    covariance[:size, :size] = np.linalg.inv(information) * squares / spare
+    lens = intrinsics_covariance(evidence(linearize(camera, *seen) for seen in zip(views, boards, strict=True)))
+    covariance = np.zeros((len(lens) + 6, len(lens) + 6))
+    covariance[:-6, :-6] = lens
     return camera.replace(covariance=covariance)
 
 

@@ -8,7 +8,7 @@ different views it rests on.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -17,8 +17,17 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision import images
 from arm5dof.vision.calibration.boards import Board, Corners
-from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
-from arm5dof.vision.calibration.views import MIN_VIEWS, BoardView, BoardViews, board_error, board_pose
+from arm5dof.vision.calibration.covariance import add_intrinsics_covariance, linearize
+from arm5dof.vision.calibration.evidence import evidence, odd_views
+from arm5dof.vision.calibration.views import (
+    MIN_VIEWS,
+    BoardView,
+    BoardViews,
+    apart,
+    board_error,
+    board_pose,
+    distinct,
+)
 from arm5dof.vision.camera import Camera
 
 SAME_VIEW = 0.02
@@ -31,6 +40,9 @@ a share of the image's larger side."""
 OUTLIER = 3.0
 """A view whose error under the others' calibration is so many times their median is not of the same camera, or has
 wrong corners."""
+
+FEW = 2
+"""So many views that do not fit are left out; more that fit each other are of another camera."""
 
 DISAGREEMENT = 2.5
 """The error of all views together may be so many times what each leaves with intrinsics of its own: 1.2 times for
@@ -52,11 +64,14 @@ class Calibration:
     rms: float
     """Root mean square of the reprojection error, pixels."""
     deviations: np.ndarray
-    """Standard deviations of the intrinsics named by `INTRINSICS`, (4 + coefficients,)."""
+    """Standard deviations of the intrinsics named by `INTRINSICS`, (4 + coefficients,): by how far the views disagree
+    or, after `fit`, OpenCV's, for which the errors of all corners are independent."""
     errors: dict[str, float]
     """Root mean square reprojection error of every view used, pixels."""
     outliers: dict[str, float]
     """The same for the views left out, under the calibration of the others."""
+    copies: dict[str, str] = field(default_factory=dict)
+    """Photographs left out because they are there twice, and of which each is a copy."""
 
     @property
     def intrinsics(self) -> np.ndarray:
@@ -89,28 +104,21 @@ def calibrate(views: BoardViews, coefficients: int = 5) -> Calibration:
     Raises:
         UserError: The views are too few, too much alike or too contradictory to tell the camera's intrinsics.
     """
-    kept, outliers = list(views.found), []
-    result = fit(kept, views.size, coefficients)
-    while len(kept) > MIN_VIEWS:
-        worst = max(kept, key=lambda view: result.errors[view.name])
-        others = [view for view in kept if view is not worst]
-        without = fit(others, views.size, coefficients)
-        if board_error(without.camera, worst.corners) <= OUTLIER * float(np.median(list(without.errors.values()))):
-            break
-        kept, result = others, without
-        outliers.append(worst)
-    if 4 * len(outliers) > len(views.found):
-        listed = ", ".join(view.name for view in outliers)
-        raise UserError(
-            f"{len(outliers)} of {len(views.found)} views do not fit the others ({listed}): use "
-            "one camera, one zoom and focus, one resolution, and a board that is flat"
-        )
-    _check_different(kept, views.size)
+    kept, copies = distinct(views.found)
+    kept, outliers, result = _of_one_camera(kept, views.size, coefficients)
+    _check_different(kept, views)
     _check_agreement(kept, result)
-    _check_deviations(result)
     seen = [view.corners for view in kept]
     camera = add_intrinsics_covariance(result.camera, seen, [board_pose(result.camera, corners) for corners in seen])
-    return replace(result, camera=camera, outliers={view.name: board_error(camera, view.corners) for view in outliers})
+    result = replace(
+        result,
+        camera=camera,
+        deviations=np.sqrt(np.diag(np.asarray(camera.covariance))[:-6]),
+        outliers={view.name: board_error(camera, view.corners) for view in outliers},
+        copies=copies,
+    )
+    _check_deviations(result)
+    return result
 
 
 def fit(views: Sequence[BoardView], size: tuple[int, int], coefficients: int = 5, flags: int = 0) -> Calibration:
@@ -159,28 +167,47 @@ def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
     return cv2.imencode(suffix, np.concatenate([image, straight], axis=1))[1].tobytes()
 
 
-def _check_different(views: Sequence[BoardView], size: tuple[int, int]) -> None:
+def _of_one_camera(
+    views: list[BoardView], size: tuple[int, int], coefficients: int
+) -> tuple[list[BoardView], list[BoardView], Calibration]:
+    """The views of one camera, those that do not fit them, and the calibration from the former."""
+    kept, outliers, division, another = views, list[BoardView](), list[BoardView](), False
+    result = fit(views, size, coefficients)
+    while len(kept) > MIN_VIEWS:
+        linear = (linearize(result.camera, corners, board_pose(result.camera, corners)) for _, corners in kept)
+        group, alone = odd_views(evidence(linear))
+        odd = [kept[i] for i in (group if alone is None else [alone])]
+        if not outliers:  # Leaving out views of the larger group first can make it the smaller one.
+            division = [kept[i] for i in group]
+        if len(odd) > FEW:
+            outliers, another = division if len(division) > FEW else [*outliers, *odd], True
+            break
+        worst = odd or [max(kept, key=lambda view: result.errors[view.name])]
+        others = [view for view in kept if all(view is not other for other in worst)]
+        without = fit(others, size, coefficients)
+        limit = OUTLIER * float(np.median(list(without.errors.values())))
+        if not odd and board_error(without.camera, worst[0].corners) <= limit:
+            break
+        kept, outliers, result = others, [*outliers, *worst], without
+    if another or 4 * len(outliers) > len(views):
+        raise UserError(
+            f"{len(outliers)} of {len(views)} views do not fit the others ({', '.join(v.name for v in outliers)}): are "
+            "they of another camera, zoom or focus? calibrate them by themselves; or is the board not flat?"
+        )
+    return kept, outliers, result
+
+
+def _check_different(kept: Sequence[BoardView], views: BoardViews) -> None:
     """Count views that are not repetitions of an earlier one."""
     different: list[Corners] = []
-    for view in views:
-        if all(_apart(view.corners, other) > SAME_VIEW * np.hypot(*size) for other in different):
+    for view in kept:
+        if all(apart(view.corners, other) > SAME_VIEW * np.hypot(*views.size) for other in different):
             different.append(view.corners)
     if len(different) < MIN_VIEWS:
         raise UserError(
-            f"only {len(different)} of {len(views)} views differ and a calibration takes {MIN_VIEWS}: photograph the "
-            "board from different sides and distances, tilted, all over the image"
+            f"only {len(different)} of {len(views.found)} views differ and a calibration takes {MIN_VIEWS}: photograph "
+            "the board from different sides and distances, tilted, all over the image"
         )
-
-
-def _apart(a: Corners, b: Corners) -> float:
-    """Mean distance in the image between the corners that two views share, pixels; infinite if they share none."""
-    places = {tuple(point): pixel for point, pixel in zip(b.points, b.pixels, strict=True)}
-    apart = [
-        np.linalg.norm(pixel - places[key])
-        for point, pixel in zip(a.points, a.pixels, strict=True)
-        if (key := tuple(point)) in places
-    ]
-    return float(np.mean(apart)) if apart else np.inf
 
 
 def _check_agreement(views: Sequence[BoardView], result: Calibration) -> None:

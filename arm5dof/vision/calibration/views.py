@@ -15,6 +15,10 @@ from arm5dof.vision.calibration.boards import Board, Corners
 from arm5dof.vision.calibration.poses import pose_matrix
 from arm5dof.vision.camera import Camera
 
+SAME_PHOTOGRAPH = 0.5
+"""Views whose corners are closer than so many pixels, on average, are one photograph twice, encoded anew perhaps, or
+two of a camera and a board that stood still: the second says nothing that the first does not."""
+
 MIN_VIEWS = 5
 """Different views that a calibration takes. OpenCV's 13 photographs give the focal length to 0.1 % from any five of
 them, and to between 0.1 and 2 % from two or three."""
@@ -75,6 +79,37 @@ def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str
             f"{summary} and a calibration takes {MIN_VIEWS}, from different sides, tilted, near and far{hint}"
         )
     return BoardViews(found, without, size)
+
+
+def distinct(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
+    """Count photographs that are there twice once.
+
+    Args:
+        views: A board in photographs.
+
+    Returns:
+        The first of those that are alike; and the name of that by the names of the others.
+    """
+    kept: list[BoardView] = []
+    copies: dict[str, str] = {}
+    for view in views:
+        first = next((other for other in kept if apart(view.corners, other.corners) < SAME_PHOTOGRAPH), None)
+        if first is None:
+            kept.append(view)
+        else:
+            copies[view.name] = first.name
+    return kept, copies
+
+
+def apart(a: Corners, b: Corners) -> float:
+    """Mean distance in the image between the corners that two views share, pixels; infinite if they share none."""
+    places = {tuple(point): pixel for point, pixel in zip(b.points, b.pixels, strict=True)}
+    distances = [
+        np.linalg.norm(pixel - places[key])
+        for point, pixel in zip(a.points, a.pixels, strict=True)
+        if (key := tuple(point)) in places
+    ]
+    return float(np.mean(distances)) if distances else np.inf
 
 
 def board_pose(camera: Camera, corners: Corners) -> np.ndarray:

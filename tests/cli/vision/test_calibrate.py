@@ -1,6 +1,7 @@
 """`arm5dof vision calibrate`: photographs of a board in, a camera out; bad input one line."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -20,16 +21,24 @@ def test_the_command_writes_a_camera_and_tells_how_well_it_is_known(photographs,
     assert command(*words) == 0
     said = capsys.readouterr().out
     assert all(path.name in said for path in photographs)
-    assert "fx          532.90 +- 0.41 pixels" in said and "error 0.185 pixels RMS" in said
+    assert "fx          532.90 +- 0.60 pixels" in said and "error 0.185 pixels RMS" in said
     camera = Camera.load(out)
     assert abs(camera.matrix[0, 0] - 532.3) <= 1 and not camera.has_extrinsics
     assert image.read_bytes().startswith(b"\x89PNG") and {out, image} == set(tmp_path.iterdir())
 
     assert command(*photographs, *words[1:5], "--out", tmp_path / "again.yml", "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    assert list(found) == ["image_size", "rms_px", "intrinsics", "errors_px", "outliers_px", "without_board"]
+    assert list(found) == ["image_size", "rms_px", "intrinsics", "errors_px", "outliers_px", "copies", "without_board"]
     assert found["intrinsics"]["fx"]["value"] == pytest.approx(camera.matrix[0, 0], abs=1e-3)
     assert len(found["errors_px"]) == 13 and found["image_size"] == [640, 480]
+
+
+def test_copies_of_photographs_are_named(photographs, tmp_path, capsys):
+    shutil.copy(photographs[2], tmp_path / "copy.jpg")
+    words = ["--board", "9x6", "--square", 0.025, "--out", tmp_path / "camera.yml"]
+    assert command(*photographs[:8], tmp_path / "copy.jpg", *words) == 0
+    said = capsys.readouterr().out
+    assert f"copy.jpg    -      left out: the same as {photographs[2].name}" in said and "8 photographs of" in said
 
 
 def test_the_command_refuses_bad_input_in_one_line(photographs, tmp_path, capfd):

@@ -27,7 +27,7 @@ def test_thirteen_photographs_give_a_camera(views):
     fx, fy, cx, cy, *_ = result.intrinsics
     assert abs(fx - 532.3) <= 1 and abs(fy - 532.3) <= 1
     assert abs(cx - 342.4) <= 2 and abs(cy - 233.2) <= 2
-    assert (result.deviations[:4] > 0.1).all() and (result.deviations[:4] < 0.6).all()
+    assert (result.deviations[:4] > 0.4).all() and (result.deviations[:4] < 1.7).all()
     assert list(result.errors) == [view.name for view in views.found]
     assert (result.camera.width, result.camera.height, result.camera.has_extrinsics) == (640, 480, False)
 
@@ -62,6 +62,19 @@ def test_as_many_coefficients_as_asked_for(views, coefficients):
     assert result.rms < 0.19
 
 
+def test_photographs_that_are_there_twice_count_once(photographs, views):
+    """Exact copies and ones encoded anew; eight of each would make the deviations 2.9 times smaller."""
+    content = cv2.imencode(".jpg", cv2.imread(str(photographs[1])), [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
+    again = BoardView("again.jpg", BOARD.find(cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)))
+    assert (again.corners.pixels != views.found[1].corners.pixels).any()
+    exact = [BoardView(f"{i} {view.name}", view.corners) for view in views.found for i in range(7)]
+    once, more = calibrate(views), calibrate(views._replace(found=[*views.found, again, *exact]))
+    assert more.copies == {"again.jpg": views.found[1].name, **{view.name: view.name.split()[1] for view in exact}}
+    np.testing.assert_allclose(more.deviations, once.deviations, rtol=1e-3)
+    np.testing.assert_allclose(np.diag(more.camera.covariance), np.diag(once.camera.covariance), rtol=1e-3)
+    assert not once.copies and list(more.errors) == list(once.errors)
+
+
 def test_repeated_views_are_refused(views):
     copies = [BoardView(f"copy {i}", views.found[0].corners) for i in range(13)]
     with pytest.raises(UserError, match="only 1 of 13 views differ"):
@@ -93,13 +106,15 @@ def test_a_view_from_another_camera_is_named(zoom, photographs, views):
 
 
 def test_two_cameras_half_and_half_are_refused(photographs, views):
-    """Neither half stands out, and together they fit to 0.7 pixels, with a focal length that is neither's."""
+    """No view stands out, and together they fit to 0.7 pixels, with a focal length that is neither's."""
     mixed, warp = list(views.found), np.array([[1.2, 0, -0.2 * 319.5], [0, 1.2, -0.2 * 239.5]])
     for i in (1, 3, 6, 8, 10, 11):
         gray = cv2.imread(str(photographs[i]), cv2.IMREAD_GRAYSCALE)
         mixed[i] = BoardView(f"other {i}", BOARD.find(cv2.warpAffine(gray, warp, (640, 480), borderValue=200)))
     assert fit(mixed, views.size).rms < 0.8
-    with pytest.raises(UserError, match=r"the views do not fit one camera: .* times what they are one by one"):
+    with pytest.raises(
+        UserError, match=r"6 of 13 views do not fit the others \(other 1, other 3, .*: are they of another camera"
+    ):
         calibrate(views._replace(found=mixed))
 
 
