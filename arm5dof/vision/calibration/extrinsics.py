@@ -10,7 +10,7 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration import hand_eye
-from arm5dof.vision.calibration.boards import Board, Corners
+from arm5dof.vision.calibration.boards import Board, BoardNotFoundError, Corners
 from arm5dof.vision.calibration.covariance import add_pose, placement_covariance, pose_covariance
 from arm5dof.vision.calibration.hand_eye import HandEye
 from arm5dof.vision.calibration.views import board_error, board_pose, image_names, read_gray
@@ -173,12 +173,17 @@ def find(camera: Camera, path: Path, board: Board) -> Corners | None:
         UserError: The board leaves its own pose open, or the photograph is not of this camera or cannot be read.
         OSError: It cannot be read.
     """
+    gray = read_gray(path)
     if board.is_ambiguous:
+        try:
+            board.check_inspected([board.inspect(gray, board.find(gray))], f"{path} does not show the {board}")
+        except BoardNotFoundError as other:
+            if other.size is not None:
+                raise
         raise UserError(
             f"the {board} looks the same after half a turn: take one with an odd and an even number of corners, or a "
             "ChArUco board"
         )
-    gray = read_gray(path)
     if gray.shape != (camera.height, camera.width):
         raise UserError(
             f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels and the camera {camera.width}x{camera.height}: take it "

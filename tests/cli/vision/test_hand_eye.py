@@ -104,7 +104,17 @@ def test_bad_input_is_one_line(shots, tmp_path, capfd):
         refused(expected, *hand_eye, good.parent / f"{name}.csv", "--eye-in-hand", *board, *out)
     refused("one of the arguments --eye-in-hand --eye-to-hand is required", *hand_eye, good, *board, *out)
     refused("if the camera is on the hand (eye in hand)", *hand_eye, good, "--eye-to-hand", *board, *out)
-    refused("after half a turn", *hand_eye, good, "--eye-in-hand", "--board", "9x7", "--square", "0.03", *out)
+    refused(
+        "show one of 8x5 inner corners: give --board 8x5",
+        *hand_eye,
+        good,
+        "--eye-in-hand",
+        "--board",
+        "9x7",
+        "--square",
+        "0.03",
+        *out,
+    )
     refused("exists: choose another", *hand_eye, good, "--eye-in-hand", *board, "--out", tmp_path / "there.yml")
 
     assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "there.yml").read_text() == "precious"
