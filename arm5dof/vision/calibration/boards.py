@@ -21,6 +21,9 @@ from arm5dof.vision.opencv import quiet
 DETECTION_SIZE = 1280
 """Boards are looked for in images reduced to at most so many pixels a side; corners are refined in the original."""
 
+MIN_SIDE = 32
+"""Pixels. In narrower images there is no board, and OpenCV's detectors raise errors of their own."""
+
 WINDOW = 0.25
 """Half the corner window, as a share of the smallest distance between corners. Windows that reach into the next
 corners pull it off its place: OpenCV's sample takes 11 pixels always, and one of its own 13 photographs is then out by
@@ -130,7 +133,7 @@ class Checkerboard:
 
     def find(self, gray: np.ndarray) -> Corners | None:
         """The corners, refined, the first one being that where the square before it is black if the board tells."""
-        grid = self._detect(gray)
+        grid = None if _is_narrow(gray) else self._detect(gray)
         if grid is None:
             return None
         grid = refine(gray, grid)
@@ -157,6 +160,8 @@ class Checkerboard:
 
     def inspect(self, gray: np.ndarray, found: Corners | None) -> Note:
         """The larger and the smaller number of corners of the whole board: a part of it can pass for a smaller one."""
+        if _is_narrow(gray):
+            return ()
         if found is not None:
             size: tuple[int, ...] = _whole_size(gray, found.pixels.reshape(self.rows, self.columns, 2))
         else:
@@ -222,6 +227,8 @@ class Charuco:
 
     def find(self, gray: np.ndarray) -> Corners | None:
         """The corners that are seen, six at least and not all in a line; part of the board is enough."""
+        if _is_narrow(gray):
+            return None
         board = self.opencv
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
         if ids is None and self.rows % 2 == 0:  # OpenCV before 4.6 began with the other colour.
@@ -237,6 +244,8 @@ class Charuco:
 
     def inspect(self, gray: np.ndarray, found: Corners | None) -> Note:
         """The markers in an image; and if they cannot be this board's, what they show instead."""
+        if _is_narrow(gray):
+            return ()
         marks, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(gray)
         seen = () if ids is None else tuple(map(int, ids.ravel()))
         if len(seen) >= MIN_MARKERS:
@@ -352,6 +361,11 @@ def _check_lengths(square: float) -> None:
             unit, metres = ("centimetres", square / 100) if square < 10 else ("millimetres", square / 1000)
             remedy = f"{metres:g} if {square:g} is in {unit}"
         raise UserError(f"squares of {square:g} m: give the side of a square in metres, {remedy}")
+
+
+def _is_narrow(gray: np.ndarray) -> bool:
+    """Whether an image, reduced as boards are looked for, has fewer than `MIN_SIDE` pixels a side."""
+    return min(gray.shape) * min(1.0, DETECTION_SIZE / max(gray.shape)) < MIN_SIDE
 
 
 def _reduced(gray: np.ndarray) -> tuple[np.ndarray, float]:

@@ -83,3 +83,10 @@ def test_the_unit_of_a_square_is_doubted():
         Checkerboard(9, 6, 2)
     with pytest.raises(UserError, match=r"0\.025 if 25 is in millimetres"):
         Charuco(8, 6, 25, 18)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4000), (3000, 2), (40, 6000)], ids=str)
+@pytest.mark.parametrize("board", [Checkerboard(9, 6, 0.02), Charuco(8, 6, 0.03, 0.022)], ids=str)
+def test_specks_and_strips_show_no_board(board, shape):
+    image = np.full(shape, 90, np.uint8)
+    assert board.find(image) is None and board.inspect(image, None) == ()
