@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from arm5dof.cli.parser import nothing_left
@@ -26,6 +27,8 @@ the photograph (beside the CSV, or with its path), the hand's place in the base 
 quaternion.
 
   arm5dof vision hand-eye camera.yml poses.csv --eye-in-hand --board 9x6 --square 0.025 --out on_hand.yml
+
+How exact the hand is, is estimated too. Poses that contradict the others are named and left out, up to a quarter.
 
 The pose goes into a new file beside the intrinsics, with the covariance of both. That of a camera on the hand is in the
 hand's frame: arm5dof vision locate takes the hand's pose with it.
@@ -59,19 +62,24 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     hands, paths = read_hand_poses(args.poses)
     camera = Camera.load(args.camera)
     board = options.board(args.board, args.square, args.charuco, args.dictionary)
-    with late_bar("looking for the board", len(paths), "photographs") as progress:
+    with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
         found = from_hand(camera, hands, paths, board, args.eye_in_hand, progress)
     found.save(args.out, board)
 
     frame, left = "hand" if args.eye_in_hand else "base", found.hand_eye
+    turn_deg, shift = math.degrees(left.noise[1]), float(left.noise[2])
     if args.json:
         more = {"frame": frame, "rotation_deg": left.rotation_deg, "translation_m": left.translation_m}
-        more |= {"used": found.used, "without_board": found.without}
+        more |= {"hand_rotation_deg": turn_deg, "hand_translation_m": shift}
+        more |= {"used": found.used, "without_board": found.without, "outliers": found.outliers}
         print(files.to_json(camera_report.as_json(found.camera) | more))
         return
     print(camera_report.pose_table(found.camera, frame))
     error = f"{left.rotation_deg:.2f} degrees and {1e3 * left.translation_m:.1f} mm RMS"
     print(f"\n{len(found.used)} photographs, error {error}")
+    print(f"the hand's own error about and along each axis: {turn_deg:.2f} degrees and {1e3 * shift:.1f} mm")
+    for name, (degrees, metres) in found.outliers.items():
+        print(f"{name}: left out: {degrees:.1f} degrees and {1e3 * metres:.0f} mm off: is the hand's pose right?")
     for name in found.without:
         print(f"{name}: left out: board not found")
     print(f"camera: {args.out}")

@@ -6,18 +6,23 @@ board, away from the camera.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision.opencv import quiet
 
 DETECTION_SIZE = 1280
 """Boards are looked for in images reduced to at most so many pixels a side; corners are refined in the original."""
+
+MIN_SIDE = 32
+"""Pixels. In narrower images there is no board, and OpenCV's detectors raise errors of their own."""
 
 WINDOW = 0.25
 """Half the corner window, as a share of the smallest distance between corners. Windows that reach into the next
@@ -25,6 +30,21 @@ corners pull it off its place: OpenCV's sample takes 11 pixels always, and one o
 1.2 pixels."""
 
 REFINE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
+
+LARGEST_SQUARE = 0.5
+"""Metres. Boards with larger squares are rare, numbers in centimetres and millimetres are not."""
+
+MIN_MARKERS = 6
+"""So many markers tell what board they are on."""
+
+MARKER_TOLERANCE = 0.15
+"""How much, as a share, the markers' size may differ from what is stated."""
+
+FAMILIES = (
+    *(f"DICT_{n}X{n}_100" for n in (4, 5, 6, 7)),
+    *("DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12", "DICT_APRILTAG_36h11"),
+)
+"""Dictionaries among which that of an unknown board is looked for."""
 
 RADIUS, SAMPLES = 0.25, 16
 """Of the circle, in squares, on which a corner is recognized by its four alternating quarters; points on it."""
@@ -37,6 +57,10 @@ class BoardNotFoundError(UserError):
         super().__init__(message)
         self.size = size
         """The inner corners, such as `9x6`, of the checkerboard that they show instead; None if they show none."""
+
+
+Note = tuple[int | str, ...]
+"""What `Board.inspect` says of an image, for `Board.check_inspected`."""
 
 
 class Corners(NamedTuple):
@@ -69,10 +93,10 @@ class Board(Protocol):
             Its corners, to a fraction of a pixel; None if it is not seen.
         """
 
-    def inspect(self, gray: np.ndarray, found: Corners | None) -> tuple[int, ...]:
+    def inspect(self, gray: np.ndarray, found: Corners | None) -> Note:
         """What kind of board an image (h, w) shows, whether or not this one was `found` in it."""
 
-    def check_inspected(self, notes: Sequence[tuple[int, ...]], context: str) -> None:
+    def check_inspected(self, notes: Sequence[Note], context: str) -> None:
         """Raise `BoardNotFoundError`, its message beginning with `context`, if images show another board than this or
         none, by what `inspect` says of each."""
 
@@ -109,7 +133,7 @@ class Checkerboard:
 
     def find(self, gray: np.ndarray) -> Corners | None:
         """The corners, refined, the first one being that where the square before it is black if the board tells."""
-        grid = self._detect(gray)
+        grid = None if _is_narrow(gray) else self._detect(gray)
         if grid is None:
             return None
         grid = refine(gray, grid)
@@ -134,8 +158,10 @@ class Checkerboard:
             found, pixels = cv2.findChessboardCornersSB(gray, size)
         return pixels.reshape(self.rows, self.columns, 2).astype(np.float32) if found else None
 
-    def inspect(self, gray: np.ndarray, found: Corners | None) -> tuple[int, ...]:
+    def inspect(self, gray: np.ndarray, found: Corners | None) -> Note:
         """The larger and the smaller number of corners of the whole board: a part of it can pass for a smaller one."""
+        if _is_narrow(gray):
+            return ()
         if found is not None:
             size: tuple[int, ...] = _whole_size(gray, found.pixels.reshape(self.rows, self.columns, 2))
         else:
@@ -143,14 +169,14 @@ class Checkerboard:
             size = meta.shape[:2] if seen else ()
         return tuple(sorted(size, reverse=True))
 
-    def check_inspected(self, notes: Sequence[tuple[int, ...]], context: str) -> None:
+    def check_inspected(self, notes: Sequence[Note], context: str) -> None:
         """Refuse images of which more show another size than this."""
         votes = Counter(size for size in notes if size)
         if not votes:
             raise BoardNotFoundError(
                 f"{context}; none of them shows any: the whole board must be seen, with a white margin and in focus"
             )
-        own = votes[max(self.columns, self.rows), min(self.columns, self.rows)]
+        own = votes[(max(self.columns, self.rows), min(self.columns, self.rows))]
         size, count = max(votes.items(), key=lambda item: item[1])
         if count > own:
             name = "x".join(map(str, size))
@@ -196,12 +222,18 @@ class Charuco:
     @property
     def opencv(self) -> cv2.aruco.CharucoBoard:
         """OpenCV's object, for instance to draw the board with `generateImage`."""
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._dictionary)
+        with quiet():
+            return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._dictionary)
 
     def find(self, gray: np.ndarray) -> Corners | None:
         """The corners that are seen, six at least and not all in a line; part of the board is enough."""
+        if _is_narrow(gray):
+            return None
         board = self.opencv
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
+        if ids is None and self.rows % 2 == 0:  # OpenCV before 4.6 began with the other colour.
+            board.setLegacyPattern(True)
+            pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
         if ids is None or len(ids) < 6 or board.checkCharucoCornersCollinear(ids):
             return None
         every = np.asarray(board.getChessboardCorners())
@@ -210,14 +242,79 @@ class Charuco:
         share = min(WINDOW, (1 - self.marker / self.square) / 2)
         return Corners(points.astype(np.float32), refine(gray, pixels.reshape(-1, 2), share))
 
-    def inspect(self, gray: np.ndarray, found: Corners | None) -> tuple[int, ...]:
-        """The markers in an image."""
-        _, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(gray)
-        return () if ids is None else tuple(map(int, ids.ravel()))
+    def inspect(self, gray: np.ndarray, found: Corners | None) -> Note:
+        """The markers in an image; and if they cannot be this board's, what they show instead."""
+        if _is_narrow(gray):
+            return ()
+        marks, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(gray)
+        seen = () if ids is None else tuple(map(int, ids.ravel()))
+        if len(seen) >= MIN_MARKERS:
+            said = self._misfit(np.reshape(marks, (-1, 4, 2)), seen)
+        else:
+            said = None if found is not None else self._other_markers(gray)
+        return seen if said is None else (*seen, said)
 
-    def check_inspected(self, notes: Sequence[tuple[int, ...]], context: str) -> None:
-        """Refuse images without markers, or with more of them than this board has."""
-        ids, there = [i for note in notes for i in note], self.columns * self.rows // 2
+    def _misfit(self, marks: np.ndarray, seen: tuple[int, ...]) -> str | None:
+        """What is wrong with markers (n, 4, 2) of the right dictionary. Their centers do not depend on the size of the
+        markers, which then follows."""
+        corners = np.concatenate([marks, np.ones((*marks.shape[:2], 1))], -1).swapaxes(0, 1)
+        centers = np.cross(np.cross(corners[0], corners[2]), np.cross(corners[1], corners[3]))
+        centers = centers[:, :2] / centers[:, 2:]
+        turned = replace(self, columns=self.rows, rows=self.columns)
+        for board, legacy in [(self, False), (self, True), (turned, False), (turned, True)]:
+            layout = board.opencv
+            layout.setLegacyPattern(legacy)
+            places = {
+                int(k): np.mean(at, 0)[:2]
+                for k, at in zip(np.ravel(layout.getIds()), layout.getObjPoints(), strict=True)
+            }
+            known = [k in places for k in seen]
+            if sum(known) < MIN_MARKERS:
+                continue
+            points = np.array([places[k] for k in seen if k in places])
+            to_board, fits = cv2.findHomography(centers[known], points, cv2.RANSAC, 0.2 * self.square)
+            if to_board is None or fits.sum() < 0.8 * len(seen):
+                continue
+            if board is turned:
+                return f"{turned.columns}x{turned.rows}"
+            flat = cv2.perspectiveTransform(marks[known].astype(float).reshape(-1, 1, 2), to_board).reshape(-1, 4, 2)
+            sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=-1)
+            share, stated = float(np.median(sides)) / self.square, self.marker / self.square
+            if abs(share / stated - 1) > MARKER_TOLERANCE:
+                return f"markers {share:.2f} times as large as its squares, not {stated:.2f} times: measure both"
+            return None
+        return None
+
+    def _other_markers(self, gray: np.ndarray) -> str | None:
+        """What markers an image shows that has too few of the right dictionary."""
+        small, _ = _reduced(gray)
+        _, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(cv2.flip(small, 1))
+        if ids is not None and len(ids) >= MIN_MARKERS:
+            return "the mirror image of one: print it again as it is, and photograph the printed side"
+        found = {}
+        for name in FAMILIES:
+            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+            _, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(small)
+            found[name] = 0 if ids is None else len(np.unique(ids))
+        name = max(found, key=found.__getitem__)
+        if found[name] < MIN_MARKERS or self.dictionary.startswith(name.removesuffix("100")):
+            return None
+        # The smaller dictionaries of a family are the beginnings of the larger.
+        needed, family = self.columns * self.rows // 2, name.removesuffix("100")
+        size = next((n for n in (50, 100, 250) if needed <= n), 1000)
+        return f"markers of {f'{family}{size}' if family != name else name}: is that the dictionary that was printed?"
+
+    def check_inspected(self, notes: Sequence[Note], context: str) -> None:
+        """Refuse images without markers, with more of them than this board has, or with those of another board."""
+        said = Counter(what for note in notes for what in note if isinstance(what, str))
+        if said:
+            what, count = said.most_common(1)[0]
+            own = sum(len(note) >= MIN_MARKERS and not isinstance(note[-1], str) for note in notes)
+            if count > own:
+                size = what if re.fullmatch(r"\d+x\d+", what) else None
+                shown = f"one of {size} squares" if size else what
+                raise BoardNotFoundError(f"{context}; {count} of the {len(notes)} show {shown}", size)
+        ids, there = [i for note in notes for i in note if isinstance(i, int)], self.columns * self.rows // 2
         if not ids:
             raise BoardNotFoundError(
                 f"{context}; they show no marker of {self.dictionary}: which dictionary was printed?"
@@ -258,8 +355,17 @@ def refine(
 
 
 def _check_lengths(square: float) -> None:
-    if not 0 < square < 10:
-        raise UserError(f"squares of {square:g} m: give the side of a square in metres, such as 0.025")
+    if not 0 < square <= LARGEST_SQUARE:
+        remedy = "such as 0.025"
+        if LARGEST_SQUARE < square < 1000:
+            unit, metres = ("centimetres", square / 100) if square < 10 else ("millimetres", square / 1000)
+            remedy = f"{metres:g} if {square:g} is in {unit}"
+        raise UserError(f"squares of {square:g} m: give the side of a square in metres, {remedy}")
+
+
+def _is_narrow(gray: np.ndarray) -> bool:
+    """Whether an image, reduced as boards are looked for, has fewer than `MIN_SIDE` pixels a side."""
+    return min(gray.shape) * min(1.0, DETECTION_SIZE / max(gray.shape)) < MIN_SIDE
 
 
 def _reduced(gray: np.ndarray) -> tuple[np.ndarray, float]:

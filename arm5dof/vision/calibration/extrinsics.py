@@ -10,7 +10,7 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration import hand_eye
-from arm5dof.vision.calibration.boards import Board, Corners
+from arm5dof.vision.calibration.boards import Board, BoardNotFoundError, Corners
 from arm5dof.vision.calibration.covariance import add_pose, placement_covariance, pose_covariance
 from arm5dof.vision.calibration.hand_eye import HandEye
 from arm5dof.vision.calibration.views import board_error, board_pose, image_names, read_gray
@@ -74,9 +74,11 @@ class HandEyeCalibration:
     hand_eye: HandEye
     """The pose before the intrinsics' errors are taken into account, and what is left unexplained."""
     used: list[str]
-    """The photographs that show the board."""
+    """The photographs from which that comes."""
     without: list[str]
     """Those that do not."""
+    outliers: dict[str, tuple[float, float]]
+    """Those that show it but do not go with the hand's pose: by how many degrees and metres."""
 
     def save(self, path: Path, board: Board) -> None:
         """Write the camera as `Camera.save` does, with notes on how it was calibrated. That of a camera on the hand is
@@ -111,8 +113,8 @@ def from_hand(
         The camera's pose in the hand's frame or the base frame, and how well it is known.
 
     Raises:
-        UserError: The photographs do not determine the pose, contradict each other, do not fit the camera's
-            intrinsics, or cannot be read.
+        UserError: The photographs do not determine the pose, contradict each other or the mount, do not fit the
+            camera's intrinsics, or cannot be read.
         OSError: They cannot be read.
     """
     seen: dict[str, tuple[np.ndarray, Corners]] = {}
@@ -123,20 +125,37 @@ def from_hand(
             seen[name] = hand, corners
         if progress is not None:
             progress(i + 1, name)
-    solve = hand_eye.eye_in_hand if eye_in_hand else hand_eye.eye_to_hand
-    poses = [hand for hand, _ in seen.values()]
+    shown = list(seen)
 
-    def solve_for(camera: Camera) -> HandEye:
-        return solve(poses, [board_pose(camera, corners) for _, corners in seen.values()])
+    def at(chosen: Sequence[str], camera: Camera) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        return [seen[name][0] for name in chosen], [board_pose(camera, seen[name][1]) for name in chosen]
 
-    result = solve_for(camera)
+    poses, boards = at(shown, camera)
+    spread = {name: board_spread(camera, seen[name][1], board) for name, board in zip(shown, boards, strict=True)}
+    judge = hand_eye.eye_in_hand if eye_in_hand else hand_eye.eye_to_hand
+    result = judge(poses, boards, [spread[name] for name in shown])
+    outliers = {shown[i]: off for i, off in result.outliers.items()}
+    used = [name for name in shown if name not in outliers]
+
+    def solve_for(camera: Camera) -> np.ndarray:
+        return hand_eye.again(*at(used, camera), [spread[name] for name in used], result.noise, eye_in_hand)
+
     return HandEyeCalibration(
-        add_pose(camera, lambda c: solve_for(c).camera, result.covariance),
+        add_pose(camera, solve_for, result.covariance),
         eye_in_hand,
         result,
-        list(seen),
+        used,
         [name for name in names if name not in seen],
+        outliers,
     )
+
+
+def board_spread(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndarray:
+    """The covariance (6, 6) of a board's pose (4, 4), by its corners: a turn about the camera's axes at its origin, a
+    shift along them."""
+    carry, (x, y, z) = np.eye(6), board[:3, 3]
+    carry[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]  # The camera's turn by w moves the board's origin p by p x w.
+    return carry @ pose_covariance(camera, corners, board) @ carry.T
 
 
 def find(camera: Camera, path: Path, board: Board) -> Corners | None:
@@ -154,12 +173,17 @@ def find(camera: Camera, path: Path, board: Board) -> Corners | None:
         UserError: The board leaves its own pose open, or the photograph is not of this camera or cannot be read.
         OSError: It cannot be read.
     """
+    gray = read_gray(path)
     if board.is_ambiguous:
+        try:
+            board.check_inspected([board.inspect(gray, board.find(gray))], f"{path} does not show the {board}")
+        except BoardNotFoundError as other:
+            if other.size is not None:
+                raise
         raise UserError(
             f"the {board} looks the same after half a turn: take one with an odd and an even number of corners, or a "
             "ChArUco board"
         )
-    gray = read_gray(path)
     if gray.shape != (camera.height, camera.width):
         raise UserError(
             f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels and the camera {camera.width}x{camera.height}: take it "

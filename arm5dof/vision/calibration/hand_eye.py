@@ -1,10 +1,7 @@
 """Hand-eye calibration: where a camera sits on the hand, or where it stands beside the arm.
 
-Both are the equation A_i X = Z B_i^-1 of the robot's poses A_i and the board's poses B_i in the camera's frame. The
-start is the closed form of Shah (2013), "Solving the robot-world/hand-eye calibration problem using the Kronecker
-product", J. Mechanisms and Robotics 5(3): rotations by a singular value decomposition, then translations by linear
-least squares. Gauss-Newton steps on what the camera measured then weigh rotations and translations by their noise, as
-the closed form cannot.
+Both are one equation of the hand's and the board's poses, which `robot_world` solves. Here is judged whether the poses
+determine an answer and agree with it: all of them, all but a few, or only if the camera is mounted the other way.
 """
 
 from __future__ import annotations
@@ -13,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
+from scipy import stats
 
 from arm5dof.errors import UserError
-from arm5dof.vision.calibration.poses import pose_matrix
+from arm5dof.vision.calibration.robot_world import EXPECTED, Fit, inverse, predict, rotation_vectors, solve
 
 MIN_POSES = 4
 """Three determine the solution and leave nothing to tell its error by."""
@@ -26,13 +23,17 @@ MIN_TURN_DEG = 5.0
 """How far the hand must turn about a second axis, root mean square over all pairs of poses. Turning about parallel
 axes leaves the camera's place along them open."""
 
-ROTATION_NOISE_DEG, TRANSLATION_NOISE_M = 0.2, 1e-3
-"""Noise of a board's pose in the camera's frame, per axis. Only their ratio acts on the solution."""
+EQUAL_SPREAD = np.diag(np.square(np.repeat([np.deg2rad(0.2), 1e-3], 3)))
+"""Covariance of a board's pose where none is stated."""
 
-CONTRADICTION = 15.0
-"""So many times that noise, root mean square, is no noise."""
+MAX_ROTATION_DEG, MAX_TRANSLATION_M = 3.0, 0.015
+"""What is left may be so large, root mean square, and still be noise."""
 
-STEPS = 20
+SUSPECTS = 5
+"""So many poses that are farthest off are tried for the worst."""
+
+OUTLIER_CHANCE = 1e-6
+"""How probable it is, at most, that among right poses one is taken for wrong, were all noise Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ class HandEye:
     covariance: np.ndarray
     """Of the camera's pose, judged by what is left, (6, 6): a turn about the camera's x, y and z axes in radians, a
     shift along them in metres."""
+    noise: np.ndarray
+    """The noise that was estimated, (3,): a factor to the boards' deviations, then the hand's standard deviation about
+    each axis, radians, and along each, metres."""
+    outliers: dict[int, tuple[float, float]]
+    """Poses that were left out, counted from 0, since they contradict the others: by how many degrees and metres."""
 
     @property
     def deviations(self) -> np.ndarray:
@@ -58,12 +64,16 @@ class HandEye:
         return np.concatenate([np.rad2deg(deviations[:3]), deviations[3:]])
 
 
-def eye_in_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> HandEye:
+def eye_in_hand(
+    hands: Sequence[np.ndarray], boards: Sequence[np.ndarray], covariances: Sequence[np.ndarray] | None = None
+) -> HandEye:
     """A camera on the hand looks at a board that stands still.
 
     Args:
         hands: The hand's poses in the base frame, (n, 4, 4), metres.
         boards: The board's poses in the camera's frame at the same moments, (n, 4, 4), metres.
+        covariances: Of those, (n, 6, 6): a turn about the camera's axes at the board's origin (radians), a shift along
+            them (metres). Only their ratios act on the solution. By default all are equal.
 
     Returns:
         The camera's pose in the hand's frame and the board's in the base frame.
@@ -71,15 +81,18 @@ def eye_in_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> Ha
     Raises:
         UserError: The poses are not such, do not determine the answer, or contradict each other.
     """
-    return _solve(_poses("hand", hands), _poses("board", boards))
+    return _judged(_Poses.read(hands, boards, covariances, on_hand=True))
 
 
-def eye_to_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> HandEye:
+def eye_to_hand(
+    hands: Sequence[np.ndarray], boards: Sequence[np.ndarray], covariances: Sequence[np.ndarray] | None = None
+) -> HandEye:
     """A camera that stands still looks at a board on the hand.
 
     Args:
         hands: As for `eye_in_hand`.
         boards: As for `eye_in_hand`.
+        covariances: As for `eye_in_hand`.
 
     Returns:
         The camera's pose in the base frame and the board's in the hand's frame.
@@ -87,90 +100,127 @@ def eye_to_hand(hands: Sequence[np.ndarray], boards: Sequence[np.ndarray]) -> Ha
     Raises:
         UserError: As for `eye_in_hand`.
     """
-    return _solve(_inverse(_poses("hand", hands)), _poses("board", boards))
+    return _judged(_Poses.read(hands, boards, covariances, on_hand=False))
 
 
-def _solve(robot: np.ndarray, boards: np.ndarray) -> HandEye:
-    """The poses X and Z with robot_i X boards_i = Z for all i, as well as that can be."""
-    if len(robot) != len(boards):
-        raise UserError(f"{len(robot)} poses of the hand and {len(boards)} of the board: give one of each per image")
-    if len(robot) < MIN_POSES:
-        raise UserError(f"{len(robot)} poses: hand-eye calibration takes {MIN_POSES} at least, better 15")
-    _check_motion(robot)
-    x, z = _closed_form(robot, boards)
-    weights = np.repeat([1 / np.deg2rad(ROTATION_NOISE_DEG), 1 / TRANSLATION_NOISE_M], 3)
-    for _ in range(STEPS):
-        residual, jacobian = _linearize(robot, boards, x, z)
-        system, right = jacobian * weights[:, None], residual * weights
-        step = np.linalg.lstsq(system.reshape(-1, 12), -right.reshape(-1), rcond=None)[0]
-        x, z = _moved(x, step[:6]), _moved(z, step[6:])
-        if np.abs(step).max() < 1e-12:
+def again(
+    hands: Sequence[np.ndarray],
+    boards: Sequence[np.ndarray],
+    covariances: Sequence[np.ndarray] | None,
+    noise: np.ndarray,
+    on_hand: bool,
+) -> np.ndarray:
+    """The camera's pose (4, 4) by poses that have been judged, with the noise that was estimated then."""
+    return _Poses.read(hands, boards, covariances, on_hand).solve(noise).x
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """What `robot_world.solve` takes."""
+
+    robot: np.ndarray
+    boards: np.ndarray
+    spread: np.ndarray
+    on_hand: bool
+
+    @classmethod
+    def read(
+        cls,
+        hands: Sequence[np.ndarray],
+        boards: Sequence[np.ndarray],
+        covariances: Sequence[np.ndarray] | None,
+        on_hand: bool,
+    ) -> _Poses:
+        """Checked. Raises `UserError` unless they determine an answer."""
+        hand, board = _poses("hand", hands), _poses("board", boards)
+        if len(hand) != len(board):
+            raise UserError(f"{len(hand)} poses of the hand and {len(board)} of the board: give one of each per image")
+        if len(hand) < MIN_POSES:
+            raise UserError(f"{len(hand)} poses: hand-eye calibration takes {MIN_POSES} at least, better 15")
+        if (second := _second_turn(hand)) < MIN_TURN_DEG:
+            raise UserError(
+                f"the hand turned about parallel axes only ({second:.1f} degrees about a second one, {MIN_TURN_DEG:g} "
+                "are needed): turn it about another axis too, by 30 degrees or more"
+            )
+        spread = np.array([EQUAL_SPREAD] * len(hand)) if covariances is None else np.asarray(covariances, float)
+        return cls(hand if on_hand else inverse(hand), board, spread, on_hand)
+
+    def __getitem__(self, chosen: Sequence[int]) -> _Poses:
+        index = list(chosen)
+        return _Poses(self.robot[index], self.boards[index], self.spread[index], self.on_hand)
+
+    @property
+    def other_mount(self) -> _Poses:
+        return _Poses(inverse(self.robot), self.boards, self.spread, not self.on_hand)
+
+    def solve(self, noise: np.ndarray | None = None) -> Fit:
+        return solve(self.robot, self.boards, self.spread, self.on_hand, noise)
+
+
+def _judged(poses: _Poses) -> HandEye:
+    """The solution, unless it is none."""
+    own, other = (_left(each.solve().residual) for each in (poses, poses.other_mount))
+    if other[0] < own[0] / 2 and other[1] < own[1] / 2:
+        mount = "beside the arm (eye to hand)" if poses.on_hand else "on the hand (eye in hand)"
+        raise UserError(
+            f"the poses contradict each other by {_said(*own)}, and only by {_said(*other)} if the camera is {mount}: "
+            "is it that, or are the hand's poses inverted?"
+        )
+    fit, wrong = _without_outliers(poses)
+    rotation, translation = _left(fit.residual)
+    if 4 * len(wrong) > len(poses.robot) or rotation > MAX_ROTATION_DEG or translation > MAX_TRANSLATION_M:
+        raise UserError(
+            f"the poses contradict each other by {_said(*own)}: give metres, the hand's poses in the base frame, the "
+            "board's in the camera's frame, in the same order"
+        )
+    return HandEye(fit.x, fit.z, rotation, translation, fit.covariance[:6, :6], fit.noise, wrong)
+
+
+def _without_outliers(poses: _Poses) -> tuple[Fit, dict[int, tuple[float, float]]]:
+    """A fit to all poses that agree, and what the others, up to a quarter, lack."""
+    kept, out = list(range(len(poses.robot))), list[int]()
+    while len(kept) > MIN_POSES and 4 * (len(out) + 1) <= len(poses.robot):
+        # Without the worst the others agree best. The noise is fixed, or the worst one's would hide it.
+        suspects = [kept[i] for i in np.argsort(-_squares(poses[kept].solve(EXPECTED)))[:SUSPECTS]]
+        rests = [[i for i in kept if i != k] for k in suspects]
+        rests = [rest for rest in rests if _second_turn(poses.robot[rest]) >= MIN_TURN_DEG]
+        if not rests:
             break
-    residual, jacobian = _linearize(robot, boards, x, z)
+        rest = min(rests, key=lambda rest: _squares(poses[rest].solve(EXPECTED)).sum())
+        out += set(kept) - set(rest)
+        kept = rest
+    while True:  # Those that are no worse than chance would have it are taken back.
+        fit = poses[kept].solve()
+        limit = 6 * stats.f.isf(OUTLIER_CHANCE / len(poses.robot), 6, 6 * len(kept) - 12)
+        residual, scatter = predict(fit, *vars(poses[out]).values()) if out else (np.zeros((0, 6)), np.zeros((0, 6, 6)))
+        off = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(scatter), residual) > limit
+        if off.all():
+            return fit, {k: _left(one[None]) for k, one in sorted(zip(out, residual, strict=True))}
+        kept += [k for k, wrong in zip(out, off, strict=True) if not wrong]
+        out = [k for k, wrong in zip(out, off, strict=True) if wrong]
+
+
+def _squares(fit: Fit) -> np.ndarray:
+    """How far each pose is off, (n,), squared, in units of the noise that is expected of a hand."""
+    return np.square(fit.residual / np.repeat(EXPECTED[1:], 3)).sum(1)
+
+
+def _left(residual: np.ndarray) -> tuple[float, float]:
+    """Root mean squares over axes and poses (n, 6): degrees and metres."""
     rotation, translation = (float(np.sqrt(np.square(part).mean())) for part in np.split(residual, 2, axis=1))
-    if rotation > np.deg2rad(CONTRADICTION * ROTATION_NOISE_DEG) or translation > CONTRADICTION * TRANSLATION_NOISE_M:
-        raise UserError(
-            f"the poses contradict each other by {np.rad2deg(rotation):.1f} degrees and {1e3 * translation:.0f} mm: "
-            "give metres, the hand's poses in the base frame, the board's in the camera's frame, in the same order"
-        )
-    system = (jacobian * weights[:, None]).reshape(-1, 12)
-    variance = np.square(residual * weights).sum() / (residual.size - 12)
-    return HandEye(
-        camera=x,
-        board=z,
-        rotation_deg=float(np.rad2deg(rotation)),
-        translation_m=translation,
-        covariance=np.linalg.inv(system.T @ system)[:6, :6] * variance,
-    )
+    return float(np.rad2deg(rotation)), translation
 
 
-def _closed_form(robot: np.ndarray, boards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """X and Z by Shah's method. For all i vec(R_X) = (R_Bi kron R_Ai^T) vec(R_Z), so both are singular vectors of the
-    mean of those products."""
-    mean = np.mean([np.kron(b[:3, :3], a[:3, :3].T) for a, b in zip(robot, boards, strict=True)], axis=0)
-    left, _, right_t = np.linalg.svd(mean)
-    x, z = np.eye(4), np.eye(4)
-    sign = np.sign(np.linalg.det(left[:, 0].reshape(3, 3)))
-    x[:3, :3] = _nearest_rotation(sign * left[:, 0].reshape(3, 3).T)
-    z[:3, :3] = _nearest_rotation(sign * right_t[0].reshape(3, 3).T)
-    # R_A (R_X t_B + t_X) + t_A = t_Z is linear in t_X and t_Z.
-    system = np.concatenate([np.concatenate([a[:3, :3], -np.eye(3)], axis=1) for a in robot])
-    right = [-a[:3, 3] - a[:3, :3] @ x[:3, :3] @ b[:3, 3] for a, b in zip(robot, boards, strict=True)]
-    shifts = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
-    x[:3, 3], z[:3, 3] = shifts[:3], shifts[3:]
-    return x, z
+def _said(rotation_deg: float, translation_m: float) -> str:
+    return f"{rotation_deg:.1f} degrees and {1e3 * translation_m:.0f} mm"
 
 
-def _linearize(robot: np.ndarray, boards: np.ndarray, x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What separates the boards' measured poses from those that X and Z explain, (n, 6), rotation vector and metres
-    in the camera's frame; and its derivative, (n, 6, 12), by the moves of X and Z that `_moved` makes."""
-    explained = _inverse(robot @ x) @ z
-    turn, shift = explained[:, :3, :3], explained[:, :3, 3]
-    residual = np.concatenate(
-        [_rotation_vectors(turn @ boards[:, :3, :3].transpose(0, 2, 1)), shift - boards[:, :3, 3]], 1
-    )
-    jacobian = np.zeros((len(robot), 6, 12))
-    jacobian[:, :3, :3], jacobian[:, 3:, 3:6] = -np.eye(3), -np.eye(3)
-    jacobian[:, 3:, :3] = _cross(shift)
-    jacobian[:, :3, 6:9], jacobian[:, 3:, 9:] = turn, turn
-    return residual, jacobian
-
-
-def _moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose after a small move (6,), rotation vector and metres, in its own frame."""
-    return pose @ pose_matrix(cv2.Rodrigues(step[:3])[0], step[3:])
-
-
-def _check_motion(robot: np.ndarray) -> None:
-    """Raise `UserError` unless the hand turned about two axes."""
-    turns = [_rotation_vectors((a[:3, :3].T @ b[:3, :3])[None])[0] for a, b in combinations(robot, 2)]
-    spread = np.sqrt(np.linalg.eigvalsh(np.mean([np.outer(turn, turn) for turn in turns], axis=0)))
-    second = np.rad2deg(spread[1])
-    if second < MIN_TURN_DEG:
-        raise UserError(
-            f"the hand turned about parallel axes only ({second:.1f} degrees about a second one, {MIN_TURN_DEG:g} are "
-            "needed): turn it about another axis too, by 30 degrees or more"
-        )
+def _second_turn(robot: np.ndarray) -> float:
+    """How far poses turned about a second axis, root mean square over all pairs, degrees."""
+    first, second = np.array(list(combinations(robot[:, :3, :3], 2))).swapaxes(0, 1)
+    turns = rotation_vectors(first.swapaxes(1, 2) @ second)
+    spread = np.linalg.eigvalsh(turns.T @ turns / len(turns))
+    return float(np.rad2deg(np.sqrt(max(0.0, spread[1]))))
 
 
 def _poses(what: str, poses: Sequence[np.ndarray]) -> np.ndarray:
@@ -183,28 +233,3 @@ def _poses(what: str, poses: Sequence[np.ndarray]) -> np.ndarray:
     if len(bad):
         raise UserError(f"pose {bad[0] + 1} of the {what} is no rotation and translation")
     return array
-
-
-def _inverse(poses: np.ndarray) -> np.ndarray:
-    result = np.zeros_like(poses)
-    turns = poses[..., :3, :3].swapaxes(-1, -2)
-    result[..., :3, :3] = turns
-    result[..., :3, 3] = -(turns @ poses[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1
-    return result
-
-
-def _rotation_vectors(turns: np.ndarray) -> np.ndarray:
-    return np.array([cv2.Rodrigues(turn)[0].ravel() for turn in turns]).reshape(-1, 3)
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (n, 3, 3) that take the cross product with vectors (n, 3) from the left."""
-    x, y, z = vectors.T
-    o = np.zeros_like(x)
-    return np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
-
-
-def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    left, _, right = np.linalg.svd(matrix)
-    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right

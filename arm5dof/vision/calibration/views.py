@@ -157,7 +157,10 @@ def image_names(paths: Sequence[Path]) -> list[str]:
 def read_gray(path: Path) -> np.ndarray:
     """A photograph in gray, (h, w), uint8. Raises `UserError` if it is none."""
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    gray = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    try:
+        gray = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    except cv2.error:  # Larger than OpenCV's limit, for instance.
+        gray = None
     if gray is None:
         raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
     return gray

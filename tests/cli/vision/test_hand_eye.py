@@ -48,6 +48,19 @@ def test_the_hand_eye_command(shots, flag, tmp_path, capsys, monkeypatch):
     assert told["without_board"] == ["10.png"] and len(told["used"]) == 10 and told["rotation_deg"] < 0.5
 
 
+def test_a_wrong_pose_is_named_and_left_out(shots, tmp_path, capsys):
+    paths, seen = shots
+    arm = hand_poses(seen, True)
+    arm[3, 0, 3] += 0.03
+    table = write_poses(paths[0].parent / "wrong.csv", arm, [path.name for path in paths])
+    KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")
+    words = ["hand-eye", tmp_path / "camera.yml", table, "--eye-in-hand", "--board", "8x5", "--square", "0.03"]
+    assert command(*words, "--out", tmp_path / "out.yml") == 0
+    said = capsys.readouterr().out
+    assert "9 photographs" in said and "3.png: left out: " in said and "is the hand's pose right?" in said
+    np.testing.assert_allclose(Camera.load(tmp_path / "out.yml", np.eye(4)).position, CAMERA[:3, 3], atol=2e-3)
+
+
 def test_bad_input_is_one_line(shots, tmp_path, capfd):
     paths, seen = shots
     KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")
@@ -90,8 +103,18 @@ def test_bad_input_is_one_line(shots, tmp_path, capfd):
     ]:
         refused(expected, *hand_eye, good.parent / f"{name}.csv", "--eye-in-hand", *board, *out)
     refused("one of the arguments --eye-in-hand --eye-to-hand is required", *hand_eye, good, *board, *out)
-    refused("contradict each other", *hand_eye, good, "--eye-to-hand", *board, *out)
-    refused("after half a turn", *hand_eye, good, "--eye-in-hand", "--board", "9x7", "--square", "0.03", *out)
+    refused("if the camera is on the hand (eye in hand)", *hand_eye, good, "--eye-to-hand", *board, *out)
+    refused(
+        "show one of 8x5 inner corners: give --board 8x5",
+        *hand_eye,
+        good,
+        "--eye-in-hand",
+        "--board",
+        "9x7",
+        "--square",
+        "0.03",
+        *out,
+    )
     refused("exists: choose another", *hand_eye, good, "--eye-in-hand", *board, "--out", tmp_path / "there.yml")
 
     assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "there.yml").read_text() == "precious"

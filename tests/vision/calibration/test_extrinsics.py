@@ -33,8 +33,13 @@ def test_extrinsics_from_a_board_at_a_known_pose(board, turn, tmp_path):
         from_board(TRUE.replace(width=320, height=240), path, board, board_to_base)
     with pytest.raises(UserError, match="does not show the 6x9 checkerboard"):
         from_board(TRUE, path, Checkerboard(6, 9, 0.025), board_to_base)
+    if isinstance(board, Checkerboard):
+        with pytest.raises(UserError, match="does not show the 9x7 checkerboard; 1 of the 1 show one of 8x5 inner"):
+            from_board(TRUE, path, Checkerboard(9, 7, 0.025), board_to_base)
+    cv2.imwrite(str(path), photograph(*draw(Checkerboard(7, 5, 0.03)), pose))
     with pytest.raises(UserError, match="after half a turn"):
-        from_board(TRUE, path, Checkerboard(9, 7, 0.025), board_to_base)
+        from_board(TRUE, path, Checkerboard(7, 5, 0.03), board_to_base)
+    cv2.imwrite(str(path), photograph(*draw(board), pose))
     wrong = TRUE.replace(distortion=np.array([3.0, 0, 0, 0, 0]))
     with pytest.raises(UserError, match="is this the camera that was calibrated"):
         from_board(wrong, path, board, board_to_base)

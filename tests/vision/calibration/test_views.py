@@ -1,12 +1,15 @@
 """Photographs in which the board is looked for: OpenCV's, and ones that will not do."""
 
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration.boards import BoardNotFoundError, Checkerboard
-from arm5dof.vision.calibration.views import MIN_VIEWS, find_views
+from arm5dof.vision.calibration.views import MIN_VIEWS, find_views, read_gray
 
 BOARD = Checkerboard(9, 6, 0.025)
 
@@ -49,3 +52,16 @@ def test_images_without_a_board(tmp_path):
         cv2.imwrite(str(paths[-1]), np.random.default_rng(i).integers(0, 255, (240, 320), np.uint8))
     with pytest.raises(UserError, match="0 of 6 photographs show the 9x6 checkerboard; none of them shows any"):
         find_views(paths, BOARD)
+
+
+def test_an_image_beyond_opencvs_limit_is_refused(tmp_path):
+    """A PNG file whose header tells of 40000 x 40000 pixels."""
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", 40000, 40000, 8, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b"")
+    (tmp_path / "huge.png").write_bytes(b"\x89PNG\r\n\x1a\n" + parts)
+    with pytest.raises(UserError, match=r"huge\.png is no image that can be read: leave it out"):
+        read_gray(tmp_path / "huge.png")
