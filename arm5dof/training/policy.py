@@ -21,6 +21,8 @@ from arm5dof.runtime.tables import Table
 AT_ONCE = 16_384
 """Goals in one device call: more take memory, and no less time each."""
 
+MOST_CORRECTIONS = 10_000
+
 
 class Policy(struct.PyTreeNode, eq=False):
     """A trained policy for one task. A pytree whose leaves are the networks and the agent's numbers.
@@ -209,8 +211,8 @@ class Policy(struct.PyTreeNode, eq=False):
             raise UserError(
                 f"solve takes {wanted} for this task, each once, not {', '.join(map(str, stated)) or 'nothing'}"
             )
-        if not isinstance(corrections, (int, np.integer)) or corrections < 0:
-            raise UserError(f"corrections = {corrections!r}: it should be a whole number, 0 or more")
+        if not isinstance(corrections, (int, np.integer)) or not 0 <= corrections <= MOST_CORRECTIONS:
+            raise UserError(f"corrections = {corrections!r}: it should be a whole number from 0 to {MOST_CORRECTIONS}")
         goals = model.goals(**given)
         if len({len(leaf) for leaf in jax.tree.leaves(goals)}) > 1:
             raise UserError(f"solve takes as many of each of {' and '.join(names)}")

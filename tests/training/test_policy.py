@@ -95,7 +95,7 @@ def test_solve_says_what_it_takes(policy: Policy):
     assert said(lambda: policy.solve()) == f"{takes}nothing"
     for wrong in (-1, 1.5, "2"):
         said_of = said(lambda wrong=wrong: policy.solve(point, corrections=wrong))
-        assert said_of == f"corrections = {wrong!r}: it should be a whole number, 0 or more"
+        assert said_of == f"corrections = {wrong!r}: it should be a whole number from 0 to 10000"
 
 
 def test_a_goal_of_several_inputs_takes_as_many_of_each(pointing: Policy):
