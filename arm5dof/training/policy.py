@@ -16,6 +16,7 @@ from arm5dof.envs.base import Goal, Observation, vectors
 from arm5dof.envs.inverse_kinematics import Answer, Candidate
 from arm5dof.envs.paths import Path
 from arm5dof.errors import UserError
+from arm5dof.runtime import forks
 from arm5dof.runtime.tables import Table
 
 AT_ONCE = 16_384
@@ -202,6 +203,7 @@ class Policy(struct.PyTreeNode, eq=False):
 
     def _goals(self, target: tuple[Any, ...], inputs: dict[str, Any], corrections: Any) -> tuple[Goal, bool]:
         """Goals with a leading axis, and whether one was stated without."""
+        forks.check()
         model = self.forward_model
         names = list(model.goal_inputs)
         given = {**dict(zip(names, target, strict=False)), **inputs}
@@ -282,6 +284,7 @@ def _pick(found: Candidate, which: np.ndarray) -> Answer:
 
 def _is_single(env: Task, obs: Any) -> bool:
     """Whether that is one observation of a task, rather than a batch of them. Raises `UserError` if it is neither."""
+    forks.check()
     sizes = _observation_sizes(env)
     wanted = " and ".join(f"{name} ({size},)" for name, size in sizes.items())
     if not isinstance(obs, dict) or obs.keys() != sizes.keys():

@@ -17,7 +17,7 @@ from annotated_types import Ge, Lt
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Task
 from arm5dof.errors import DivergedError, UserError
-from arm5dof.runtime import xla
+from arm5dof.runtime import forks, xla
 from arm5dof.runtime.programs import Program
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
@@ -68,6 +68,7 @@ class Trainer:
     state: Training
 
     def __init__(self, env: Task, config: Settings) -> None:
+        forks.check()
         budget, length = config.train, env.episode_length
         for name in ("episodes", "evaluate_every", "checkpoint_every"):
             if getattr(budget, name) % budget.num_envs:
@@ -147,6 +148,7 @@ class Trainer:
 
     def start(self) -> None:
         """Begin a new run."""
+        forks.check()
         with xla.gc_paused():
             self.check()
             _ = self._epoch  # Everything else is compiled while this is.
@@ -159,6 +161,7 @@ class Trainer:
     def advance(self) -> dict[str, float]:
         """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and what the
         task has to watch of the policy without noise. Raises `DivergedError` if one of them is no finite number."""
+        forks.check()
         leaves, metrics = self._ready(*self._leaves(self.state))
         self.state = jax.tree.unflatten(jax.tree.structure(self.like), leaves)
         metrics.update(self._watch())
