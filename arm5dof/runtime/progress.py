@@ -50,8 +50,7 @@ class Bar:
             _Rate(),
             TextColumn("{task.fields[note]}", style="cyan", markup=False),
             TimeElapsedColumn(),
-            TextColumn("ETA"),
-            TimeRemainingColumn(),
+            _Remaining(),
             console=self._console,
             disable=not self._console.is_terminal,
             transient=True,
@@ -89,7 +88,7 @@ class Bar:
             rate = max(done - self._first, 1) / (now - self._started)
             of, eta = "", ""
             if self.total is not None:
-                of, eta = f"/{self.total}", f"  ETA {(self.total - done) / rate:.0f} s"
+                of, eta = f"/{self.total}", f"  ETA {(self.total - done) / rate:.0f} s" if done < self.total else ""
             self.say(f"{self.what}: {done}{of} {self.unit}  {_per_second(rate)}  {note}{eta}")
 
     def say(self, line: str) -> None:
@@ -111,6 +110,13 @@ def late_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], 
                 bar.update(done, note)
 
         yield update
+
+
+class _Remaining(TimeRemainingColumn):
+    """When it will be done; nothing once all is but what the note tells."""
+
+    def render(self, task: Task) -> Text:
+        return Text("") if task.finished else Text.assemble("ETA ", super().render(task))
 
 
 class _Rate(ProgressColumn):

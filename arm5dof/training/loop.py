@@ -190,7 +190,17 @@ def _save_at_once(made: Trainer, checkpoints: Checkpoints) -> None:
 def _evaluate(run: Run, made: Trainer, reporter: Reporter) -> dict[str, Any]:
     protocol, at, env = run.config.evaluate, made.counters, made.env
     targets = protocol.targets if made.finished else protocol.interim_targets
-    show = lambda done: reporter.update(at.episodes, f"evaluating {done}/{targets} targets")
+    first: tuple[float, int] | None = None
+
+    def show(done: int) -> None:
+        nonlocal first
+        left = ""
+        if first is None and done:  # What comes before also compiles.
+            first = time.monotonic(), done
+        elif first is not None and done < targets:
+            left = f", {(time.monotonic() - first[0]) / (done - first[1]) * (targets - done):.0f} s left"
+        reporter.update(at.episodes, f"evaluating {done}/{targets} targets{left}")
+
     show(0)
     results = evaluate.evaluate(made.policy(), targets, run.config.train.seed, show)
     reporter.say(

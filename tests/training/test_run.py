@@ -4,12 +4,14 @@ what it was made from, and for no other settings than its own."""
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import re
 import shutil
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -25,7 +27,7 @@ from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.errors import FolderGoneError
 from arm5dof.runtime import files
 from arm5dof.sweeps.compare import compare
-from arm5dof.training import config, evaluate, trainer
+from arm5dof.training import config, evaluate, loop, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import load_config
 from arm5dof.training.loop import Silent, resume, train
@@ -568,3 +570,15 @@ def test_a_program_beyond_the_memory_is_refused_before_it_runs(twenty: Path, mon
     monkeypatch.setattr(trainer, "memory_free", lambda: 1000)
     for call in (made.check, made.start, made.advance):
         assert re.search(r"takes 0.0 GB.* and 0.0 GB are free: choose a smaller", said(call))
+
+
+def test_an_evaluation_says_how_long_it_takes_still(twenty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """20 targets a chunk, of which the second and third take a second each."""
+    folder, notes, clock = copy(twenty, tmp_path / "run"), list[str](), itertools.count(100.0)
+    (folder / "evaluations.json").unlink()
+    told = Told()
+    told.update = lambda done, note="": notes.append(note)
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    resume(edit(folder, **{"evaluate.targets": 80}), told)
+    shown = [f"evaluating {done}/80 targets" for done in (0, 20, 40, 60, 80)]
+    assert notes[-5:] == [shown[0], shown[1], f"{shown[2]}, 2 s left", f"{shown[3]}, 1 s left", shown[4]]
