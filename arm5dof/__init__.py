@@ -6,7 +6,10 @@ The names below are imported when they are first used: importing the package cos
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # Importing typing takes longer than all else that is done here.
+    from typing import Any
 
 __version__ = "0.2.0.dev0"
 

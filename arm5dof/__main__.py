@@ -1,7 +1,21 @@
-"""`python -m arm5dof`."""
+"""`python -m arm5dof`, and the command `arm5dof`."""
 
-import sys
+from arm5dof.cli import interrupts
 
-from arm5dof.cli.main import main
 
-sys.exit(main())
+def main() -> None:
+    """Run the command line and end the process."""
+    interrupts.listen()
+    try:
+        from arm5dof.cli.main import main as run
+
+        status = run()
+    except Exception:
+        if interrupts.heard():
+            interrupts.end()
+        raise
+    interrupts.leave(status)
+
+
+if __name__ == "__main__":
+    main()

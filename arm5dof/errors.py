@@ -17,6 +17,10 @@ class DivergedError(Exception):
     """A training came to numbers that are not finite. The command line prints it and exits with 1."""
 
 
+class FolderGoneError(Exception):
+    """The folder of a run went away while it was trained. The command line prints it and exits with 1."""
+
+
 class Terminated(KeyboardInterrupt):
     """A request to end (SIGTERM, as clusters send it), which is obeyed where it loses nothing."""
 

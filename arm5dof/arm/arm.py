@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -77,6 +77,10 @@ class Arm:
     """Why this site is the end effector, if none was named; else empty."""
     held: tuple[str, ...]
     """Names of the joints that were taken out to hold the base."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle and copies, which have the compiled model alone: nothing keeps a model's description whole."""
+        return {**{f.name: getattr(self, f.name) for f in fields(self)}, "mj_spec": None}
 
     @cached_property
     def free_model(self) -> mujoco.MjModel:

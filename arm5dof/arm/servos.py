@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -52,6 +53,10 @@ class Servos:
         # FULLPHYSICS begins with these, in this order.
         ends = np.cumsum([1, self.model.nq, self.model.nv, self.model.na])
         self._qpos, self._qvel, self._act = (slice(a, b) for a, b in pairwise(ends))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle and copies: without threads."""
+        return {name: value for name, value in vars(self).items() if name not in ("_pool", "_data")}
 
     def rest(
         self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray, before: np.ndarray, ctrl: np.ndarray

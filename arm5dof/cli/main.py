@@ -12,9 +12,9 @@ import warnings
 from collections.abc import Sequence
 
 from arm5dof import __version__
-from arm5dof.cli import arm, compare, evaluate, export, grasp, solve, sweep, train, vision
+from arm5dof.cli import arm, compare, evaluate, export, grasp, interrupts, solve, sweep, train, vision
 from arm5dof.cli.parser import Parser
-from arm5dof.errors import DivergedError, Terminated, UserError
+from arm5dof.errors import DivergedError, FolderGoneError, Terminated, UserError
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except UserError as error:
         print(f"arm5dof: {error}", file=sys.stderr)
-    except DivergedError as error:
+    except (DivergedError, FolderGoneError) as error:
         print(f"arm5dof: {error}", file=sys.stderr)
         return 1
     except BrokenPipeError:
@@ -50,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         kept = "; what was complete is kept" if error.errno in NO_ROOM else ""
         print(f"arm5dof: {error.strerror or error}{place}{kept}", file=sys.stderr)
     except KeyboardInterrupt as stop:
+        interrupts.handled()
         print(f"arm5dof: {str(stop) or 'interrupted'}", file=sys.stderr)
         return 143 if isinstance(stop, Terminated) else 130
     return 2

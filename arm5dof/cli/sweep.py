@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from arm5dof.cli.parser import nothing_left, positive
@@ -93,10 +92,11 @@ def run(args: argparse.Namespace, rest: list[str]) -> int | None:
                 reporter=bar,
                 loggers=args.log or (),
             )
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        if not (out / "sweep.json").is_file():
+            raise
         named = f"{args.sweep} " if args.sweep else ""
-        print(f"arm5dof: interrupted; go on with arm5dof sweep {named}--out {out} --resume", file=sys.stderr)
-        return 130
+        raise type(stop)(f"interrupted; go on with arm5dof sweep {named}--out {out} --resume") from None
     print(done)
     print(f"table, figures and the best: {done.folder}")
     return None

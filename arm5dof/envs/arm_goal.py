@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from annotated_types import Ge
+from annotated_types import Ge, Le
 
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.computed_servos import with_servos
@@ -62,9 +62,9 @@ class ArmGoalConfig:
     least squares from the policy's answer, which also finds the nearest that the joint limits allow."""
     branches: Annotated[int, Ge(1)] = static(default=1, may_change=True)
     """How many of the policy's candidate answers are corrected, those that come nearest first; the best counts."""
-    restarts: Annotated[int, Ge(0)] = static(default=0, may_change=True)
+    restarts: Annotated[int, Ge(0), Le(1000)] = static(default=0, may_change=True)
     """From how many random poses damped least squares starts beside, for goals that no answer came near (jacobian)."""
-    refinements: Annotated[int, Ge(0)] = static(default=10, may_change=True)
+    refinements: Annotated[int, Ge(0), Le(10_000)] = static(default=10, may_change=True)
     """How often the target is corrected for the `refined` and the `episode` figure of an evaluation."""
 
 

@@ -19,7 +19,7 @@ from flax import struct
 
 from arm5dof.envs.metrics import Error, Metric, Score
 from arm5dof.errors import UserError
-from arm5dof.runtime import xla
+from arm5dof.runtime import forks, xla
 
 if TYPE_CHECKING:
     import mujoco
@@ -112,6 +112,7 @@ class Task(ABC):
     """How people read what `evaluate` and `watch` return, by name."""
 
     def __init__(self, config: Any) -> None:
+        forks.check()
         xla.check_numbers()
         self.config = config
 

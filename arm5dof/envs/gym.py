@@ -6,7 +6,8 @@ is NumPy.
 
 from __future__ import annotations
 
-from typing import Any, Literal, cast, get_args
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from arm5dof.envs.base import Env, GoalEnv, Observation, State
 from arm5dof.envs.vector import VectorEnv
 from arm5dof.errors import UserError
+from arm5dof.runtime import forks
 
 try:
     import gymnasium
@@ -48,6 +50,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def __init__(self, env: Env, num_envs: int, episode_length: int, observation: Shown = "state") -> None:
         """`episode_length` is the time limit in steps. To show goals, `env` must be a `GoalEnv` that keeps its goal
         in `info["goal"]`."""
+        forks.check()
         if observation not in get_args(Shown):
             raise UserError(f"observation must be one of {', '.join(get_args(Shown))}, not {observation!r}")
         if observation == "goal" and not isinstance(env, GoalEnv):
@@ -57,8 +60,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._shown, self._goal_env = observation, cast(GoalEnv, env)
         self._batch = VectorEnv(env, episode_length)
         self._state: State | None = None
-        self._start = jax.jit(self._traced_start)
-        self._advance = jax.jit(self._traced_advance, donate_argnums=0)
+        self._compile()
 
         first, _ = jax.eval_shape(self._traced_start, np.uint32(0))[1]
         shown = jax.tree.map(lambda x: spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32), first)
@@ -70,6 +72,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     def reset(self, *, seed: int | None = None, options: Infos | None = None) -> tuple[Any, Infos]:
         """Start all environments over. The same seed gives the same bits; without a seed, the random numbers go on
         from where they are. There are no options."""
+        forks.check()
         super().reset(seed=seed)
         self._state, first = self._start(self.np_random.integers(2**32, dtype=np.uint32))
         obs, infos = _to_numpy(first)
@@ -77,6 +80,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Observations, rewards, terminations, truncations and infos, as the class says."""
+        forks.check()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         self._state, outcome, final = self._advance(self._state, np.asarray(actions, np.float32))
@@ -90,6 +94,20 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
                 final_obs[i] = row if over[i] else None
             infos |= _masked({"final_obs": final_obs, "final_info": _masked(reached, over)}, over)
         return obs, rewards, terminated, truncated, infos
+
+    def _compile(self) -> None:
+        self._start = jax.jit(self._traced_start)
+        self._advance = jax.jit(self._traced_advance, donate_argnums=0)
+
+    def __getstate__(self) -> Infos:
+        """For pickle and copies, which go on with the same bits: without compiled programs, keys as numbers."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("_start", "_advance")}
+        return {**kept, "_state": jax.tree.map(_Kept.of, self._state)}
+
+    def __setstate__(self, kept: Infos) -> None:
+        vars(self).update(kept)
+        self._state = jax.tree.map(_Kept.restored, kept["_state"], is_leaf=lambda leaf: isinstance(leaf, _Kept))
+        self._compile()
 
     def _traced_start(self, seed: jax.Array) -> tuple[State, Any]:
         state = self._batch.reset(jax.random.split(jax.random.key(seed), self.num_envs))
@@ -148,9 +166,18 @@ class GymGoalEnv(GymEnv):
         traced = jax.make_jaxpr(env.goal_reward)(goal, goal, action).jaxpr
         if any(traced.invars[-1] in equation.invars for equation in traced.eqns):
             raise UserError(f"the rewards of {type(env).__name__} depend on the action: replay in hindsight lacks it")
-        _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), goal))
+        self._env, self._goal = env, goal
+
+    @cached_property
+    def _rewards(self) -> Any:
+        env, action = self._env, jnp.zeros(self._env.action_size)
+        _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._goal))
         reward = lambda achieved, wanted: env.goal_reward(unravel(achieved), unravel(wanted), action)[0]
-        self._rewards = jax.jit(jnp.vectorize(reward, signature="(n),(n)->()"))
+        return jax.jit(jnp.vectorize(reward, signature="(n),(n)->()"))
+
+    def __getstate__(self) -> Infos:
+        """See `GymVectorEnv`."""
+        return {name: value for name, value in vars(self).items() if name != "_rewards"}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Infos]:
         """As in `GymEnv.step`."""
@@ -161,7 +188,23 @@ class GymGoalEnv(GymEnv):
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
         """The rewards, (...) float32, for having reached goals (..., size) where others were asked for."""
+        forks.check()
         return np.array(self._rewards(np.asarray(achieved_goal, np.float32), np.asarray(desired_goal, np.float32)))[()]
+
+
+class _Kept(NamedTuple):
+    """An array as pickle and copies keep it."""
+
+    values: np.ndarray
+    is_key: bool
+
+    @staticmethod
+    def of(leaf: jax.Array) -> _Kept:
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return _Kept(np.array(jax.random.key_data(leaf) if is_key else leaf), is_key)
+
+    def restored(self) -> jax.Array:
+        return jax.random.wrap_key_data(jnp.array(self.values)) if self.is_key else jnp.array(self.values)
 
 
 def _vectors(goals: Any) -> jax.Array:

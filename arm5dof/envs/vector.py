@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from arm5dof.envs.base import Env, State
+from arm5dof.runtime import forks
 
 T = TypeVar("T")
 
@@ -31,10 +32,12 @@ class VectorEnv:
 
     def reset(self, keys: jax.Array) -> State:
         """Start one environment for each key."""
+        forks.check()
         return jax.vmap(self._reset)(keys)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Step all environments with actions (batch, action_size)."""
+        forks.check()
         return jax.vmap(self._step)(state, action)
 
     def _reset(self, key: jax.Array) -> State:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
@@ -44,6 +46,26 @@ def shipped(folder: str, suffix: str) -> list[str]:
 def _roots(folder: str) -> tuple[Path, Path]:
     """An installed wheel carries the folders inside the package, a checkout beside it."""
     return PACKAGE / folder, PACKAGE.parent / folder
+
+
+@contextmanager
+def undamaged(path: Path, remedy: str = "take it from a copy") -> Iterator[None]:
+    """Raise `UserError` for what goes wrong when a file is read and taken for what it should be."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, csv.Error) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(f"{path} is damaged ({reason}): {remedy}") from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file. Raises `UserError` if it is none."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError, RecursionError) as error:
+        raise UserError(f"{path} is not valid TOML: {error}") from None
 
 
 @contextmanager

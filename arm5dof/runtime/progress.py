@@ -34,9 +34,8 @@ PATIENCE_S = 2.0
 class Bar:
     """A progress bar on stderr with rate, ETA and a note; where stderr is no terminal, a line every ten seconds.
 
-    `total` is None where nobody knows it: then there is no ETA. An interrupt (Ctrl-C) that gets lost while it is shown,
-    as in a callback of the garbage collector, of which JAX has one, is raised again by the next `update`, and a request
-    to end (SIGTERM) is raised there as `Terminated`.
+    `total` is None where nobody knows it: then there is no ETA. A request to end (SIGTERM) is raised by the next
+    `update` as `Terminated`.
     """
 
     def __init__(self, what: str, total: int | None, unit: str, done: int = 0) -> None:
@@ -51,8 +50,7 @@ class Bar:
             _Rate(),
             TextColumn("{task.fields[note]}", style="cyan", markup=False),
             TimeElapsedColumn(),
-            TextColumn("ETA"),
-            TimeRemainingColumn(),
+            _Remaining(),
             console=self._console,
             disable=not self._console.is_terminal,
             transient=True,
@@ -60,36 +58,28 @@ class Bar:
             redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),
         )
         self._task = self._progress.add_task(what, total=total, completed=done, note="")
-        self._before: dict[signal.Signals, Any] = {}
-        self._stop: type[KeyboardInterrupt] | None = None
+        self._before: Any = None
+        self._asked_to_end = False
 
     def __enter__(self) -> Bar:
         self._progress.start()
-        if threading.current_thread() is threading.main_thread():
-            for number, usual, ours in (
-                (signal.SIGINT, signal.default_int_handler, self._interrupt),
-                (signal.SIGTERM, signal.SIG_DFL, self._terminate),
-            ):
-                if signal.getsignal(number) is usual:
-                    self._before[number] = signal.signal(number, ours)
+        on_main_thread = threading.current_thread() is threading.main_thread()
+        if on_main_thread and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+            self._before = signal.signal(signal.SIGTERM, self._terminate)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
         self._progress.stop()
 
-    def _interrupt(self, *_: object) -> None:
-        self._stop = KeyboardInterrupt
-        raise KeyboardInterrupt
-
     def _terminate(self, *_: object) -> None:
-        self._stop = Terminated
+        self._asked_to_end = True
 
     def update(self, done: int, note: str = "") -> None:
         """Move to `done` and show a note."""
-        if self._stop:
-            raise self._stop
+        if self._asked_to_end:
+            raise Terminated
         self.done = done
         self._progress.update(self._task, completed=done, note=note)
         now = time.monotonic()
@@ -98,7 +88,7 @@ class Bar:
             rate = max(done - self._first, 1) / (now - self._started)
             of, eta = "", ""
             if self.total is not None:
-                of, eta = f"/{self.total}", f"  ETA {(self.total - done) / rate:.0f} s"
+                of, eta = f"/{self.total}", f"  ETA {(self.total - done) / rate:.0f} s" if done < self.total else ""
             self.say(f"{self.what}: {done}{of} {self.unit}  {_per_second(rate)}  {note}{eta}")
 
     def say(self, line: str) -> None:
@@ -120,6 +110,13 @@ def late_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], 
                 bar.update(done, note)
 
         yield update
+
+
+class _Remaining(TimeRemainingColumn):
+    """When it will be done; nothing once all is but what the note tells."""
+
+    def render(self, task: Task) -> Text:
+        return Text("") if task.finished else Text.assemble("ETA ", super().render(task))
 
 
 class _Rate(ProgressColumn):

@@ -38,9 +38,7 @@ class Comparison:
         for label, rows in self.curves.items():
             last = {str(row["member"]): row for row in rows}.values()
             measured = [row for row in last if row.get("headline") is not None and row["status"] == DONE]
-            counts = [
-                f"{max((row[name] for row in measured), default=0):g}" for name in ("episodes", "updates", "seconds")
-            ]
+            counts = [_most(measured, name) for name in ("episodes", "updates", "seconds")]
             value = estimate(row["headline"] for row in measured)
             lines.append([label, str(len(measured)), *counts, spelled_estimate(value)])
         return Table("Comparison", ("of", "seeds", "episodes", "updates", "seconds", self.headline.label), lines)
@@ -100,6 +98,12 @@ def compare(*folders: str | Path) -> Comparison:
             raise UserError(f"{path} has no evaluation yet: resume it")
     assert headline is not None
     return Comparison(headline, curves)
+
+
+def _most(rows: Sequence[Mapping[str, Any]], name: str) -> str:
+    """The greatest of what rows have; nothing is known of a run's seconds once its metrics are lost."""
+    known = [row[name] for row in rows if row[name] is not None]
+    return f"{max(known):g}" if known else "-"
 
 
 def _curves(path: Path) -> tuple[Headline, figures.Curves]:

@@ -8,7 +8,6 @@ import fcntl
 import json
 import subprocess
 import time
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -59,11 +58,7 @@ class Sweep:
         path = folder / "sweep.toml"
         if not path.is_file() or not (folder / "sweep.json").is_file():
             raise UserError(f"{folder} is no sweep: it has no sweep.toml and sweep.json")
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{path} is not valid TOML: {error}") from None
-        return Sweep(folder, spec.parse(values))
+        return Sweep(folder, spec.read(path.absolute()))
 
     @staticmethod
     def create(asked: Spec, folder: Path) -> Sweep:
@@ -109,7 +104,9 @@ class Sweep:
 
     @cached_property
     def _revision(self) -> str:
-        return str(json.loads((self.folder / "sweep.json").read_text(encoding="utf-8"))["revision"])
+        path = self.folder / "sweep.json"
+        with files.undamaged(path, "take it from a copy of the sweep"):
+            return str(json.loads(path.read_text(encoding="utf-8"))["revision"])
 
     @cached_property
     def headline(self) -> Headline:

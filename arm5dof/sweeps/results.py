@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from arm5dof.errors import UserError
 from arm5dof.runtime import files
 from arm5dof.sweeps.spec import Member
 from arm5dof.sweeps.summary import Headline
@@ -35,6 +33,9 @@ def member_rows(folder: Path, member: Member, revision: str, headline: Headline)
         Rows by column: `member`, the settings that vary, `status`, `reason`, `revision`, versions, counters, `seconds`
         since its training began (compilation and evaluations included), `headline`, the number by which members are
         judged, and every metric in the unit that its name says, in SI units below `means`.
+
+    Raises:
+        UserError: A file of its run is damaged.
     """
     ending = ended(folder, member.name)
     begun = (folder / member.name / "run.json").is_file()
@@ -45,12 +46,8 @@ def member_rows(folder: Path, member: Member, revision: str, headline: Headline)
     if not begun:
         return [row]
     opened = Run(folder / member.name, member.config)
-    versions = json.loads((opened.folder / "run.json").read_text(encoding="utf-8"))["versions"]
-    row |= {name: versions.get(name, "") for name in VERSIONS}
-    try:
-        found, seconds = opened.evaluations, _seconds(opened)
-    except UserError:  # Another process is writing them.
-        found, seconds = [], {}
+    row |= {name: opened.record["versions"].get(name, "") for name in VERSIONS}
+    found, seconds = opened.evaluations, _seconds(opened)
     return [{**row, **_measured(e, seconds, headline)} for e in found] or [row]
 
 

@@ -144,10 +144,7 @@ def read(path: str | Path) -> Spec:
     if found is None:
         names = ", ".join(name for name in files.shipped("experiments", ".toml") if name.startswith("sweep_"))
         raise UserError(f"no sweep {str(path)!r}: give a TOML file, or one of those shipped: {names}")
-    try:
-        values = tomllib.loads(found.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{found} is not valid TOML: {error}") from None
+    values = files.read_toml(found)
     try:
         return parse(values, found.parent)
     except UserError as error:

@@ -195,9 +195,10 @@ def finish(folder: Path, name: str, ending: Ending) -> Ending:
 def ended(folder: Path, name: str) -> Ending | None:
     """How a member ended, or None if it has not."""
     try:
-        return Ending(**json.loads((folder / f"{name}.json").read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        found = Ending(**json.loads((folder / f"{name}.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError):
         return None
+    return found if found.status in (DONE, DIVERGED, FAILED, PRUNED) and isinstance(found.reason, str) else None
 
 
 def _built(text: str) -> Config:

@@ -8,7 +8,6 @@ import functools
 import importlib
 import importlib.util
 import sys
-import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -111,7 +110,7 @@ def load_config(experiment: str | Path = "reach.toml", /, **overrides: Any) -> C
     if path is None:
         names = ", ".join(shipped_experiments())
         raise UserError(f"no experiment {str(experiment)!r}: give a TOML file, or one of those shipped: {names}")
-    values = _read(path)
+    values = files.read_toml(path)
     if "axes" in values or "variants" in values:
         raise UserError(f"{path} is a sweep, not an experiment: run it with arm5dof sweep {path}")
     return override(build(values, str(path), path.parent, fill=True), overrides)
@@ -150,7 +149,7 @@ def build(values: Mapping[str, Any], source: str = "", folder: Path | None = Non
         classes = {"env": task_class(task, folder).Config, "ddpg": DDPGConfig, "train": TrainConfig}
         classes["evaluate"] = EvaluateConfig
         path = files.shipped_file("experiments", f"{task}.toml") if fill and ":" not in task else None
-        shipped = {} if path is None else _read(path)
+        shipped = {} if path is None else files.read_toml(path)
         merged = {section: {**shipped.get(section, {}), **values.get(section, {})} for section in SECTIONS}
         merged["env"].pop("task", None)
         return Config(task, **{name: build_section(name, classes[name], merged[name]) for name in SECTIONS})
@@ -272,13 +271,6 @@ def build_section(name: str, cls: Any, values: Mapping[str, Any]) -> Any:
         return cls(**values)
     except UserError as error:
         raise UserError(f"{name}.{error}") from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path} is not valid TOML: {error}") from None
 
 
 def _import(module: str, folder: Path | None) -> Any:

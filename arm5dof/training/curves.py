@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from arm5dof.errors import UserError
+from arm5dof.envs.metrics import Metric
 from arm5dof.runtime import files
 from arm5dof.training.trainer import Counters
 
 METRICS, EVALUATIONS = "metrics.csv", "evaluations.json"
+REMEDY = "take it from a copy of the run, or remove it to go on without what it held"
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The complete rows, counters as whole numbers. Raises `UserError` for what is no number."""
+    """The rows that are complete, as the last of a run that is trained or was killed need not be; counters as whole
+    numbers. Raises `UserError` for anything else."""
     path = folder / METRICS
     if not path.exists():
         return []
-    with undamaged(path), open(path, newline="", encoding="utf-8") as handle:
-        rows = [row for row in csv.DictReader(handle) if all(row.values()) and None not in row]
-        return [{k: int(v) if k in Counters._fields else float(v) for k, v in row.items()} for row in rows]
+    with files.undamaged(path, REMEDY):
+        text = path.read_bytes().decode()
+        lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())
+        names = next(lines, [])
+        rows = [dict(zip(names, line, strict=True)) for line in lines]
+        found = [{k: int(v) if k in Counters._fields else float(v) for k, v in row.items()} for row in rows]
+        _check_counters(found)
+        for row in found:
+            _ = row["seconds"], row["reward"], row["nonfinite"]
+        return found
 
 
 def write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
@@ -52,14 +62,33 @@ def appending(folder: Path, rows: list[dict[str, Any]]) -> Iterator[Callable[[di
         yield write
 
 
-def read_evaluations(folder: Path) -> list[dict[str, Any]]:
-    """The evaluations. Raises `UserError` for what is none."""
+def read_evaluations(folder: Path, metrics: Mapping[str, Metric]) -> list[dict[str, Any]]:
+    """The evaluations, in which the task's metrics are as they summarise. Raises `UserError` for anything else."""
     path = folder / EVALUATIONS
     if not path.exists():
         return []
-    with undamaged(path):
+    with files.undamaged(path, REMEDY):
         found = _numbers(json.loads(path.read_text(encoding="utf-8")))
-        return [{**e, "steps": int(e["steps"])} for e in found]
+        if not isinstance(found, list):
+            raise TypeError("it is no list")
+        _check_counters(found)
+        for evaluation in found:
+            if not evaluation["targets"] > 0:
+                raise ValueError("there were no targets")
+            sum(evaluation["means"].values())
+            for name in evaluation.keys() & metrics.keys():
+                metric, summary = metrics[name], evaluation[name]
+                float(metric.number(summary)), metric.cells(summary), metric.text(summary)
+        return found
+
+
+def _check_counters(found: Iterable[Mapping[str, Any]]) -> None:
+    """Raise `ValueError`, or what comes of it, for rows whose counters are no whole numbers that grow."""
+    counted = [[row[name] for name in Counters._fields] for row in found]
+    if any(type(value) is not int or value < 0 for counters in counted for value in counters):
+        raise ValueError("a counter is no whole number")
+    if any(now[0] <= before[0] for before, now in itertools.pairwise(counted)):
+        raise ValueError("steps do not grow")
 
 
 def _numbers(value: Any) -> Any:
@@ -74,13 +103,3 @@ def _numbers(value: Any) -> Any:
 def write_evaluations(folder: Path, evaluations: list[dict[str, Any]]) -> None:
     """Replace the evaluations."""
     files.write_text(folder / EVALUATIONS, files.to_json(evaluations, indent=1) + "\n")
-
-
-@contextmanager
-def undamaged(path: Path) -> Iterator[None]:
-    """Raise `UserError` for what goes wrong when a file of a run is read."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, csv.Error) as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise UserError(f"{path} is damaged ({reason}): take it from a copy of the run") from None

@@ -13,6 +13,7 @@ from annotated_types import Ge
 from arm5dof.envs import Task
 from arm5dof.envs.metrics import Metric, Summary
 from arm5dof.errors import UserError
+from arm5dof.runtime import forks
 from arm5dof.runtime.tables import Table
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
@@ -50,6 +51,7 @@ def evaluate(
         By name of the task's metrics what was measured, summarised as the metric says; and `means`, the mean of every
         array measured, in SI units.
     """
+    forks.check()
     key = _stream(seed)
     chunk = min(CHUNK, targets)
     parts: dict[str, list[np.ndarray]] = {}

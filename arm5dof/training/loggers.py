@@ -217,7 +217,10 @@ class Wandb:
 
         self._path = run.folder / "wandb.json"
         if self._path.exists():
-            self._kept = json.loads(self._path.read_text(encoding="utf-8"))
+            with files.undamaged(self._path, "remove it to send the curves to a new run of Weights & Biases"):
+                found = json.loads(self._path.read_text(encoding="utf-8"))
+                sent = {str(kind): int(step) for kind, step in found["sent"].items()}
+                self._kept: dict[str, Any] = {"id": str(found["id"]), "points": int(found["points"]), "sent": sent}
         else:
             self._kept = {"id": uuid.uuid4().hex[:8], "points": 0, "sent": {}}
         self._run = wandb.init(

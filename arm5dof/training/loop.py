@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import jax
 
 from arm5dof.envs import Task
+from arm5dof.runtime import files
 from arm5dof.training import curves, evaluate, report, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import Config, make_env
@@ -100,6 +101,7 @@ def resume(
     Raises:
         UserError: Its checkpoint is damaged or was made with other settings, a logger is missing, or another process
             trains it.
+        FolderGoneError: Its folder was moved or removed meanwhile.
 
     >>> import tempfile
     >>> from arm5dof import Run, load_config, resume
@@ -111,17 +113,24 @@ def resume(
     arm5dof.errors.UserError: no logger 'tensorbord': did you mean 'tensorboard'?
     """
     ready = make_loggers(loggers)
-    with run.locked(), closing(run.checkpoints()) as checkpoints:
+    with run.locked() as check_folder, closing(run.checkpoints()) as checkpoints:
         reporter = reporter or Silent()
         # What no longer fits is said before a trainer is made of it.
         if changed := checkpoints.check():
             told = ", ".join(f"{name} {before} -> {now}" for name, (before, now) in changed.items())
             reporter.say(f"changed since the last checkpoint: {told}")
-        _train(run, made or run.trainer(), checkpoints, reporter, ready)
+        _train(run, made or run.trainer(), checkpoints, reporter, ready, check_folder)
     return run
 
 
-def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter, loggers: list[Logger]) -> None:
+def _train(
+    run: Run,
+    made: Trainer,
+    checkpoints: Checkpoints,
+    reporter: Reporter,
+    loggers: list[Logger],
+    check_folder: Callable[[], None],
+) -> None:
     budget = run.config.train
     reporter.update(0, "compiling")
     if checkpoints.latest is None:
@@ -133,6 +142,11 @@ def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter
     at = made.counters
     rows = [row for row in curves.read_rows(run.folder) if row["steps"] <= at.steps]
     evaluations = [e for e in run.evaluations if e["steps"] <= at.steps]
+    with files.undamaged(run.folder / curves.EVALUATIONS, curves.REMEDY):
+        for found in evaluations:
+            _ = made.env.failure(found), found[made.env.headline]
+    if at.steps and (not rows or rows[-1]["steps"] < at.steps):
+        reporter.say(f"{run.folder / curves.METRICS} lacks what was trained before episode {at.episodes}")
     before = rows[-1]["seconds"] if rows else 0.0
     started = time.monotonic()
 
@@ -143,11 +157,13 @@ def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter
                 due = made.due(at, budget.evaluate_every)
                 if (due or made.finished) and all(e["steps"] != at.steps for e in evaluations):
                     evaluations.append(_evaluate(run, made, reporter))
+                    check_folder()
                     curves.write_evaluations(run.folder, evaluations)
                     log.evaluation(evaluations[-1])
                 if made.finished:
                     break
                 metrics = made.advance()
+                check_folder()
                 at, seconds = made.counters, time.monotonic() - started
                 rows.append(trainer.row(at, before + seconds, metrics))
                 write(rows[-1])
@@ -156,8 +172,10 @@ def _train(run: Run, made: Trainer, checkpoints: Checkpoints, reporter: Reporter
                 if made.due(at, budget.checkpoint_every) or made.finished:
                     checkpoints.save(made.state)
         except KeyboardInterrupt:
+            check_folder()
             _save_at_once(made, checkpoints)
             raise
+    check_folder()
     report.write(run.folder, run.config, made.env, rows, evaluations)
 
 
@@ -172,7 +190,17 @@ def _save_at_once(made: Trainer, checkpoints: Checkpoints) -> None:
 def _evaluate(run: Run, made: Trainer, reporter: Reporter) -> dict[str, Any]:
     protocol, at, env = run.config.evaluate, made.counters, made.env
     targets = protocol.targets if made.finished else protocol.interim_targets
-    show = lambda done: reporter.update(at.episodes, f"evaluating {done}/{targets} targets")
+    first: tuple[float, int] | None = None
+
+    def show(done: int) -> None:
+        nonlocal first
+        left = ""
+        if first is None and done:  # What comes before also compiles.
+            first = time.monotonic(), done
+        elif first is not None and done < targets:
+            left = f", {(time.monotonic() - first[0]) / (done - first[1]) * (targets - done):.0f} s left"
+        reporter.update(at.episodes, f"evaluating {done}/{targets} targets{left}")
+
     show(0)
     results = evaluate.evaluate(made.policy(), targets, run.config.train.seed, show)
     reporter.say(

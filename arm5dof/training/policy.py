@@ -16,10 +16,13 @@ from arm5dof.envs.base import Goal, Observation, vectors
 from arm5dof.envs.inverse_kinematics import Answer, Candidate
 from arm5dof.envs.paths import Path
 from arm5dof.errors import UserError
+from arm5dof.runtime import forks
 from arm5dof.runtime.tables import Table
 
 AT_ONCE = 16_384
 """Goals in one device call: more take memory, and no less time each."""
+
+MOST_CORRECTIONS = 10_000
 
 
 class Policy(struct.PyTreeNode, eq=False):
@@ -200,6 +203,7 @@ class Policy(struct.PyTreeNode, eq=False):
 
     def _goals(self, target: tuple[Any, ...], inputs: dict[str, Any], corrections: Any) -> tuple[Goal, bool]:
         """Goals with a leading axis, and whether one was stated without."""
+        forks.check()
         model = self.forward_model
         names = list(model.goal_inputs)
         given = {**dict(zip(names, target, strict=False)), **inputs}
@@ -209,8 +213,8 @@ class Policy(struct.PyTreeNode, eq=False):
             raise UserError(
                 f"solve takes {wanted} for this task, each once, not {', '.join(map(str, stated)) or 'nothing'}"
             )
-        if not isinstance(corrections, (int, np.integer)) or corrections < 0:
-            raise UserError(f"corrections = {corrections!r}: it should be a whole number, 0 or more")
+        if not isinstance(corrections, (int, np.integer)) or not 0 <= corrections <= MOST_CORRECTIONS:
+            raise UserError(f"corrections = {corrections!r}: it should be a whole number from 0 to {MOST_CORRECTIONS}")
         goals = model.goals(**given)
         if len({len(leaf) for leaf in jax.tree.leaves(goals)}) > 1:
             raise UserError(f"solve takes as many of each of {' and '.join(names)}")
@@ -280,6 +284,7 @@ def _pick(found: Candidate, which: np.ndarray) -> Answer:
 
 def _is_single(env: Task, obs: Any) -> bool:
     """Whether that is one observation of a task, rather than a batch of them. Raises `UserError` if it is neither."""
+    forks.check()
     sizes = _observation_sizes(env)
     wanted = " and ".join(f"{name} ({size},)" for name, size in sizes.items())
     if not isinstance(obs, dict) or obs.keys() != sizes.keys():

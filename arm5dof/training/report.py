@@ -70,15 +70,15 @@ def markdown(
     title: str, config: Config, env: Task, rows: list[dict[str, Any]], evaluations: list[dict[str, Any]]
 ) -> str:
     """`report.md`."""
-    last, final = rows[-1], evaluations[-1]
+    final, seconds = evaluations[-1], f"{float(rows[-1]['seconds']):.0f} s" if rows else "an unknown time"
     resets = sum(float(row["nonfinite"]) for row in rows)
     settings = "\n".join(f"| {name} | {value} |" for name, value in config.flat().items())
     explained = inspect.getdoc(env.evaluate) or ""
     return f"""# {title}
 
-Task {config.task}: {last["episodes"]} episodes of {env.episode_length} steps ({last["env_steps"]} transitions),
-{last["updates"]} updates, seed {config.train.seed};
-{float(last["seconds"]):.0f} s with compilation and evaluations on the way.
+Task {config.task}: {final["episodes"]} episodes of {env.episode_length} steps ({final["env_steps"]} transitions),
+{final["updates"]} updates, seed {config.train.seed};
+{seconds} with compilation and evaluations on the way.
 Environments reset for non-finite physics: {resets:.0f}.
 
 ## Measured on {final["targets"]} unseen targets

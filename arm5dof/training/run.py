@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import json
-import tomllib
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from typing import Any
 import jax
 
 from arm5dof.envs import Task
-from arm5dof.errors import UserError
+from arm5dof.errors import FolderGoneError, UserError
 from arm5dof.runtime import files
 from arm5dof.runtime.tables import Table
 from arm5dof.training import config, curves, evaluate, robot
@@ -84,10 +84,7 @@ class Run:
             raise UserError(
                 f"{folder} is no run: it has no config.toml and run.json; a run is what arm5dof train leaves behind"
             )
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{path} is not valid TOML: {error}") from None
+        values = files.read_toml(path)
         settings = config.build(values, str(path))
         stated = {f"{section}.{name}" for section, given in values.items() for name in given}
         return Run(folder, settings, frozenset(settings.flat().keys() - stated))
@@ -137,14 +134,25 @@ class Run:
     @cached_property
     def env(self) -> Task:
         """The environment, with the robot that the run was made for, whatever happened to its MJCF since."""
-        path = self.folder / "run.json"
-        with curves.undamaged(path):
-            record = json.loads(path.read_text(encoding="utf-8"))
-            version, digests = str(record["versions"]["mujoco"]), dict(record["model"])
-        env = make_env(self.config, robot.kept(self.folder, version, digests))
+        digests = self.record["model"]
+        env = make_env(self.config, robot.kept(self.folder, self.record["versions"]["mujoco"], digests))
         if env.mj_model is not None and not digests:
+            path = self.folder / "run.json"
             raise UserError(f"{path} is damaged (it names no robot): take it from a copy of the run")
         return env
+
+    @cached_property
+    def record(self) -> dict[str, dict[str, str]]:
+        """What `run.json` says: `versions` of what made the run, and digests of the files of its robot, `model`. Raises
+        `UserError` if it is damaged."""
+        path = self.folder / "run.json"
+        with files.undamaged(path, "take it from a copy of the run"):
+            found = json.loads(path.read_text(encoding="utf-8"))
+            record = {name: dict(found[name]) for name in ("versions", "model")}
+            if {type(value) for values in record.values() for value in values.values()} - {str}:
+                raise TypeError("versions and digests are text")
+            _ = record["versions"]["mujoco"]
+            return record
 
     def trainer(self) -> Trainer:
         """The run's training program."""
@@ -181,7 +189,7 @@ class Run:
     @property
     def evaluations(self) -> list[dict[str, Any]]:
         """The evaluations so far: counters, `targets`, and what `evaluate` returns."""
-        return curves.read_evaluations(self.folder)
+        return curves.read_evaluations(self.folder, config.task_class(self.config.task).metrics)
 
     def checkpoints(self, read_only: bool = False) -> Checkpoints:
         """The run's checkpoints, which know what they were made with and what of that may change."""
@@ -189,14 +197,27 @@ class Run:
         return Checkpoints(self.folder / "checkpoints", fixed, budget, read_only, self.left_open)
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the run for one process. The kernel lets go of the lock when the process ends, however it ends."""
-        with open(self.folder / ".lock", "w") as handle:
+    def locked(self) -> Iterator[Callable[[], None]]:
+        """Hold the run for one process. The kernel lets go of the lock when the process ends, however it ends.
+
+        Yields:
+            What raises `FolderGoneError` once the folder is no longer where it was: whoever writes there would make
+            another.
+        """
+        path = self.folder / ".lock"
+
+        def check() -> None:
+            if not path.exists() or not os.path.samestat(path.stat(), os.fstat(handle.fileno())):
+                raise FolderGoneError(
+                    f"{self.folder} was moved or removed while it was trained: nothing more of it is kept"
+                )
+
+        with open(path, "w") as handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise UserError(f"{self.folder} is being trained by another process") from None
-            yield
+            yield check
 
     def _table(self) -> Table:
         task = config.task_class(self.config.task)

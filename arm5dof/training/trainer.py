@@ -17,12 +17,12 @@ from annotated_types import Ge, Lt
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Task
 from arm5dof.errors import DivergedError, UserError
-from arm5dof.runtime import xla
+from arm5dof.runtime import forks, xla
 from arm5dof.runtime.programs import Program
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
 
-Count = Annotated[int, Ge(1)]
+Count = Annotated[int, Ge(1), Lt(2**31)]
 
 WATCHED = 0x9B0E
 """The stream of random numbers on which a task is watched."""
@@ -68,6 +68,7 @@ class Trainer:
     state: Training
 
     def __init__(self, env: Task, config: Settings) -> None:
+        forks.check()
         budget, length = config.train, env.episode_length
         for name in ("episodes", "evaluate_every", "checkpoint_every"):
             if getattr(budget, name) % budget.num_envs:
@@ -80,6 +81,11 @@ class Trainer:
         self.env = env
         self.config = config
         self.total_steps = budget.episodes // budget.num_envs * length
+        if self.total_steps * config.ddpg.updates_per_step >= 2**31:
+            raise UserError(
+                f"{self.total_steps} steps of {config.ddpg.updates_per_step} updates are more than 2147483647 updates, "
+                "the most that are counted: choose fewer episodes, or more environments"
+            )
         self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
         self._init = jax.jit(self.agent.init, compiler_options=xla.effort(0))
 
@@ -103,20 +109,38 @@ class Trainer:
         """Shapes and types of the state."""
         return self._init.eval_shape(self.config.ddpg, jax.random.key(0))
 
+    @property
+    def bytes_needed(self) -> dict[str, int]:
+        """What a training takes of the device's memory at least, by the setting that it is in proportion to."""
+        agent, like = self.config.ddpg, self.like
+        size = lambda *trees: sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(trees))
+        networks = like.networks
+        layers = agent.actor_width * agent.actor_depth + agent.heads * agent.critic_width * agent.critic_depth
+        sampled = agent.updates_per_step * self.replay_bytes // like.replay.capacity
+        return {
+            "replay_capacity": self.replay_bytes,
+            "num_envs": size(like.env),
+            "batch_size": agent.batch_size * (4 * layers + sampled),
+            "actor_width": size(networks.actor, networks.target_actor, like.actor_optimizer),
+            "critic_width": size(networks.critic, networks.target_critic, like.critic_optimizer),
+        }
+
     def check(self) -> None:
-        """Raises `UserError` if the replay buffer cannot fit into the device's memory, or never fills a batch, or the
-        arm has something that its dynamics cannot simulate."""
+        """Raises `UserError` if a training cannot fit into the device's memory, or the replay buffer never fills a
+        batch, or the arm has something that its dynamics cannot simulate. Nothing is allocated."""
         most = min(self.config.ddpg.replay_capacity, self.total_steps * self.config.train.num_envs)
         if most < self.config.ddpg.batch_size:
             raise UserError(
                 f"batch_size = {self.config.ddpg.batch_size}, but the replay buffer never holds more than {most} "
                 "transitions: nothing would be learnt; choose a smaller batch_size, or more episodes"
             )
-        needed, free = self.replay_bytes, memory_free()
-        if needed > free:
+        needed, free = self.bytes_needed, memory_free()
+        if sum(needed.values()) > free:
+            name = max(needed, key=lambda name: needed[name])
+            value = {**vars(self.config.ddpg), **vars(self.config.train)}[name]
             raise UserError(
-                f"replay_capacity = {self.config.ddpg.replay_capacity} takes {needed / 1e9:.1f} GB and "
-                f"{free / 1e9:.1f} GB are free: choose a smaller one"
+                f"{name} = {value} takes {needed[name] / 1e9:.1f} GB and {free / 1e9:.1f} GB are free: choose a "
+                "smaller one"
             )
         if not self._simulated:
             self.env.check()
@@ -124,19 +148,21 @@ class Trainer:
 
     def start(self) -> None:
         """Begin a new run."""
+        forks.check()
         with xla.gc_paused():
             self.check()
-            epoch = self._epoch  # Everything else is compiled while this is.
+            _ = self._epoch  # Everything else is compiled while this is.
             state = self._init(self.config.ddpg, jax.random.key(self.config.train.seed))
             # Bound to its device, as epochs return it: the policy would be compiled once for either.
             self.state = jax.tree.map(lambda x: jax.device_put(x, x.sharding), state)
             self._watch()
-            epoch.result()
+            _ = self._ready
 
     def advance(self) -> dict[str, float]:
         """One epoch. Returns its metrics: means over the epoch, how many steps led to non-finite physics, and what the
         task has to watch of the policy without noise. Raises `DivergedError` if one of them is no finite number."""
-        leaves, metrics = self._epoch.result()(*self._leaves(self.state))
+        forks.check()
+        leaves, metrics = self._ready(*self._leaves(self.state))
         self.state = jax.tree.unflatten(jax.tree.structure(self.like), leaves)
         metrics.update(self._watch())
         found = {name: float(value) for name, value in jax.device_get(metrics).items()}
@@ -172,6 +198,18 @@ class Trainer:
         """Compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
         epoch = self._program.jit(donate_argnums=1, compiler_options=xla.effort(2))
         return ThreadPoolExecutor(1).submit(epoch.lower(*self._leaves(self.like)).compile)
+
+    @cached_property
+    def _ready(self) -> jax.stages.Compiled:
+        """The compiled epoch. Raises `UserError` if what it takes beside the state does not fit into the memory."""
+        compiled = self._epoch.result()
+        needed, free = getattr(compiled.memory_analysis(), "temp_size_in_bytes", 0), memory_free()
+        if needed > free:
+            raise UserError(
+                f"an epoch takes {needed / 1e9:.1f} GB beside its state and {free / 1e9:.1f} GB are free: choose a "
+                "smaller batch_size, num_envs or updates_per_step"
+            )
+        return compiled
 
     def _watch(self) -> dict[str, jax.Array]:
         """What the task has to watch, on random numbers that neither training nor evaluation uses."""

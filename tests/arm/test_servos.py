@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import mujoco
@@ -159,3 +160,12 @@ def test_unnamed_joints_and_those_with_keyframes_get_servos_too():
 def test_a_compiled_model_cannot_be_given_servos():
     with pytest.raises(UserError, match="joint 'a', 'b' has no position actuator: load the arm from its MJCF"):
         with_servos(load_arm(robot().compile()))
+
+
+def test_a_copy_rests_where_the_servos_do():
+    servos = Servos(load_arm("reach.xml"))
+    assert servos.settle_steps == pickle.loads(pickle.dumps(servos)).settle_steps == 3
+    told = servos.hold(servos.arm.home[None])
+    start = (np.zeros((1, servos.model.nq)), np.zeros((1, servos.model.nv)), np.zeros((1, 0)), 0 * told, told)
+    for found, expected in zip(pickle.loads(pickle.dumps(servos)).rest(*start), servos.rest(*start), strict=True):
+        np.testing.assert_array_equal(found, expected)

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
+import os
+import pickle
+import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -320,3 +326,67 @@ def test_without_gymnasium(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delitem(sys.modules, "arm5dof.envs.gym")
     with pytest.raises(ImportError, match=r"pip install 'arm5dof\[gym\]'"):
         importlib.import_module("arm5dof.envs.gym")
+
+
+# Copies
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_with_the_same_bits(copied: Callable[[Any], Any], kinematic: Reach):
+    """In the middle of episodes, those that end on the way included."""
+    env = GymVectorEnv(kinematic, 2, LENGTH)
+    env.reset(seed=SEED)
+    env.step(env.action_space.sample())
+    other = copied(env)
+    actions = np.linspace(-1, 1, 2 * 5, dtype=np.float32).reshape(2, 5)
+    for _ in range(LENGTH - 1):  # The last of which ends the episodes.
+        found, expected = other.step(actions), env.step(actions)
+        arrays_equal(found[:4], expected[:4])
+    arrays_equal(*(np.stack(infos["final_obs"]) for infos in (found[4], expected[4])))
+    arrays_equal(other.reset(), env.reset())
+
+
+def test_single_environments_have_copies(singles: dict[str, GymEnv]):
+    for env in (singles["dict"], singles["goal"]):
+        env.reset(seed=SEED)
+        other, action = pickle.loads(pickle.dumps(env)), np.zeros(env.action_space.shape, np.float32)
+        arrays_equal(other.step(action), env.step(action))
+        arrays_equal(other.reset()[0], env.reset()[0])
+
+
+FORKED = """
+import os
+import gymnasium
+from helpers.environments import Walk
+from arm5dof.envs.gym import GymEnv
+from arm5dof.errors import UserError
+
+if __name__ == "__main__":
+    env = GymEnv(Walk(), 5)
+    env.reset(seed=0)
+    if os.fork() == 0:
+        try:
+            env.step(env.action_space.sample())
+        except UserError as error:
+            print(error, flush=True)
+        os._exit(0)
+    os.wait()
+    try:
+        gymnasium.vector.AsyncVectorEnv([lambda: GymEnv(Walk(), 5)] * 2, context="fork")
+    except (EOFError, ConnectionError):
+        pass  # A worker says by itself why it ended.
+    several = gymnasium.vector.AsyncVectorEnv([lambda: GymEnv(Walk(), 5)] * 2, context="spawn")
+    print(several.reset(seed=0)[0].shape)
+    several.close()
+"""
+
+
+def test_a_fork_is_an_error_with_a_remedy(tmp_path: Path):
+    (tmp_path / "forks.py").write_text(FORKED)
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), str(root / "tests")])}
+    command = [sys.executable, str(tmp_path / "forks.py")]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=200)
+    forked, shape = done.stdout.splitlines()
+    assert 'context="spawn"' in forked and shape.startswith("(2, "), done.stderr
+    assert f"arm5dof.errors.UserError: {forked}" in done.stderr

@@ -3,9 +3,11 @@
 import json
 import math
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from arm5dof.envs.metrics import Error
 from arm5dof.runtime import files
 from arm5dof.training import curves
 
@@ -34,7 +36,8 @@ def test_json_is_json(value):
 
 
 def test_evaluations_of_physics_that_blew_up_are_json(tmp_path):
-    curves.write_evaluations(tmp_path, [{"steps": 3, "episode": {"median_mm": math.inf, "within": {"1": 0.0}}}])
+    counters = {"steps": 3, "episodes": 1, "env_steps": 6, "updates": 0, "targets": 9, "means": {"episode": math.inf}}
+    curves.write_evaluations(tmp_path, [{**counters, "episode": Error().summary(np.array([math.inf]))}])
     json.loads((tmp_path / curves.EVALUATIONS).read_text(), parse_constant=refuse)
-    (found,) = curves.read_evaluations(tmp_path)
+    (found,) = curves.read_evaluations(tmp_path, {"episode": Error()})
     assert found["steps"] == 3 and math.isnan(found["episode"]["median_mm"]) and found["episode"]["within"]["1"] == 0

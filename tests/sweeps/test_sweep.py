@@ -117,7 +117,7 @@ def test_what_cannot_be_done_is_said_before_anything_starts(done, asked, experim
     assert "holds the results of another sweep" in said(lambda: sweep(other, done.folder, resume=True))
     (tmp_path / "other").mkdir()
     assert "is no sweep" in said(lambda: sweep(asked, tmp_path / "other", resume=True))
-    huge = {**asked, "fixed": {"replay_capacity": 10**13}}
+    huge = {**asked, "fixed": {"replay_capacity": 2**31 - 1}}
     assert "choose fewer workers or a smaller replay_capacity" in said(lambda: sweep(huge, tmp_path / "huge"))
     odd = {**asked, "fixed": {"episodes": 7}}
     assert "is no multiple of num_envs" in said(lambda: sweep(odd, tmp_path / "odd"))

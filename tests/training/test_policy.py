@@ -1,5 +1,8 @@
 """A policy called from Python: what it takes, what it gives, and what it says of mistakes."""
 
+import copy
+import pickle
+from collections.abc import Callable
 from typing import ClassVar
 
 import jax
@@ -11,7 +14,7 @@ from helpers.errors import said
 
 from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG, DDPGConfig
-from arm5dof.envs import State, Task
+from arm5dof.envs import State, Task, VectorEnv
 from arm5dof.envs.inverse_kinematics import candidates, solve
 from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
@@ -95,7 +98,7 @@ def test_solve_says_what_it_takes(policy: Policy):
     assert said(lambda: policy.solve()) == f"{takes}nothing"
     for wrong in (-1, 1.5, "2"):
         said_of = said(lambda wrong=wrong: policy.solve(point, corrections=wrong))
-        assert said_of == f"corrections = {wrong!r}: it should be a whole number, 0 or more"
+        assert said_of == f"corrections = {wrong!r}: it should be a whole number from 0 to 10000"
 
 
 def test_a_goal_of_several_inputs_takes_as_many_of_each(pointing: Policy):
@@ -290,3 +293,15 @@ def test_near_and_path_say_what_they_take(policy: Policy):
     assert said(lambda: policy.path([point])).startswith("path takes the goals of a line")
     assert said(lambda: policy.path([point] * 2, start=np.zeros((2, 5)))) == ("start takes one pose, not 2")
     assert said(lambda: policy.solve_all([point])) == "solve_all takes one goal"
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))])
+def test_a_copy_answers_with_the_same_bits(policy: Policy, copied: Callable[[Policy], Policy]):
+    goals = [[0.15, 0.05, 0.12], [-0.1, 0.1, 0.2]]
+    other = copied(policy)
+    assert other.env is not policy.env
+    np.testing.assert_array_equal(other.solve(goals).q, policy.solve(goals).q)
+    vector, keys = VectorEnv(other.env, 5), jax.random.split(jax.random.key(0), 2)
+    jax.tree.map(
+        np.testing.assert_array_equal, copied(vector).reset(keys).obs, VectorEnv(policy.env, 5).reset(keys).obs
+    )

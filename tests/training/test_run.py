@@ -4,12 +4,14 @@ what it was made from, and for no other settings than its own."""
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import re
 import shutil
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -22,8 +24,10 @@ from helpers.errors import said
 from arm5dof.cli import main as cli
 from arm5dof.ddpg import DDPGConfig
 from arm5dof.envs.reach_pose import ReachPoseConfig
+from arm5dof.errors import FolderGoneError
 from arm5dof.runtime import files
-from arm5dof.training import config, evaluate
+from arm5dof.sweeps.compare import compare
+from arm5dof.training import config, evaluate, loop, trainer
 from arm5dof.training.checkpoint import Checkpoints
 from arm5dof.training.config import load_config
 from arm5dof.training.loop import Silent, resume, train
@@ -417,26 +421,97 @@ def test_a_damaged_robot_is_refused(runs: dict[str, Path], elsewhere: Path, harm
 
 
 @pytest.mark.parametrize(
-    "text", ["", "garbage", "[]", "3", "{}", '{"model": {}}', '{"versions": {}, "model": {}}', "\x00\xff"]
+    "text", ["", "garbage", "[]", "3", "{}", '{"model": {}}', '{"versions": {}, "model": {}}', "\x00\xff", "[" * 10_000]
 )
 @pytest.mark.parametrize("name", ["run.json", "evaluations.json"])
 def test_damaged_records_are_refused(runs: dict[str, Path], elsewhere: Path, name: str, text: str):
     folder = copy(runs["finished"], elsewhere / "run")
     (folder / name).write_bytes(text.encode("latin-1"))
     calls = {"run.json": lambda: Run.open(folder).policy(), "evaluations.json": lambda: Run.open(folder).evaluations}
-    if name == "evaluations.json" and text in ("[]", "{}"):
+    if name == "evaluations.json" and text == "[]":
         assert Run.open(folder).evaluations == []
         return
     for call in (calls[name], lambda: resume(Run.open(folder))):
         assert re.search(rf"{name} is damaged \(.+\): take it from a copy of the run", said(call))
 
 
-def test_damaged_metrics_are_refused(runs: dict[str, Path], elsewhere: Path):
+@pytest.mark.parametrize("name", ["steps", "targets", "one_shot", "means"])
+@pytest.mark.parametrize("value", ["gone", None, "x", -1, {}])
+def test_evaluations_that_are_none_are_refused(runs: dict[str, Path], elsewhere: Path, name: str, value: object):
+    """Whatever is read of them later is read at once."""
+    folder = copy(runs["finished"], elsewhere / "run")
+    kept = json.loads((folder / "evaluations.json").read_text())
+    kept[-1][name] = value
+    if value == "gone":
+        del kept[-1][name]
+    (folder / "evaluations.json").write_text(json.dumps(kept))
+    calls = [lambda: resume(Run.open(folder))]
+    if (name, value) not in (("one_shot", "gone"), ("means", {})):  # Which this task alone asks for.
+        calls.append(lambda: compare(folder))
+    for call in calls:
+        assert re.search(r"evaluations.json is damaged \(.+\): .*, or remove it to go on", said(call))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("\n8,", "\neight,"),
+        ("steps,", "step,"),
+        ("reward", "price"),
+        ("\n8,", "\n9,8,"),
+        ("\n8,", "\n80,"),
+        ("s", "\x00"),
+    ],
+)
+def test_damaged_metrics_are_refused(runs: dict[str, Path], elsewhere: Path, old: str, new: str):
     folder = copy(runs["finished"], elsewhere / "run")
     text = (folder / "metrics.csv").read_text()
-    (folder / "metrics.csv").write_text(text.replace("\n8,", "\neight,"))
-    for call in (lambda: Run.open(folder).metrics, lambda: resume(Run.open(folder))):
+    (folder / "metrics.csv").write_text(text.replace(old, new, 1))
+    for call in (lambda: Run.open(folder).metrics, lambda: resume(Run.open(folder)), lambda: compare(folder)):
         assert "metrics.csv is damaged" in said(call)
+
+
+def test_a_row_that_is_being_written_does_not_count(runs: dict[str, Path], elsewhere: Path):
+    folder = copy(runs["finished"], elsewhere / "run")
+    text = (folder / "metrics.csv").read_bytes()
+    (folder / "metrics.csv").write_bytes(text[:-3])  # Its last number would be another.
+    assert Run.open(folder).metrics["steps"] == Run.open(runs["finished"]).metrics["steps"][:-1]
+
+
+class Removes(Told):
+    """A reporter that removes the folder, or puts a copy of it in its place, after the first epoch."""
+
+    def __init__(self, folder: Path, copied: bool) -> None:
+        super().__init__()
+        self.folder, self.copied = folder, copied
+
+    def update(self, done: int, note: str = "") -> None:
+        if done and self.folder.exists():
+            if self.copied:
+                copy(self.folder, self.folder.parent / "copy")
+            shutil.rmtree(self.folder)
+            if self.copied:
+                (self.folder.parent / "copy").rename(self.folder)
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_a_folder_that_goes_away_ends_its_training(runs: dict[str, Path], elsewhere: Path, copied: bool):
+    folder = copy(runs["half"], elsewhere / "run")
+    with pytest.raises(FolderGoneError, match="was moved or removed while it was trained"):
+        resume(Run.open(folder), Removes(folder, copied))
+    assert folder.exists() == copied
+    if copied:
+        assert resume(Run.open(folder)).evaluations == Run.open(runs["finished"]).evaluations
+
+
+def test_what_is_lost_of_the_curves_is_said_and_measured_anew(runs: dict[str, Path], elsewhere: Path):
+    folder, told, whole = copy(runs["finished"], elsewhere / "run"), Told(), Run.open(runs["finished"])
+    (folder / "metrics.csv").unlink()
+    assert compare(folder).table.rows[0][2:5] == ["4", "50", "-"]
+    (folder / "evaluations.json").unlink()
+    run = resume(Run.open(folder), told)
+    assert any("metrics.csv lacks what was trained before episode 4" in line for line in told.lines)
+    assert run.evaluations == whole.evaluations[-1:] and "an unknown time" in (folder / "report.md").read_text()
 
 
 @pytest.mark.parametrize("gone", [False, True])
@@ -488,3 +563,22 @@ def test_another_mujoco_needs_the_robots_mjcf(runs: dict[str, Path], elsewhere: 
     del record["model"]["model.zip"]
     (folder / "run.json").write_text(json.dumps(record))
     assert "keeps its robot as MuJoCo 3.0.0 has it: install that version" in said(Run.open(folder).policy)
+
+
+def test_a_program_beyond_the_memory_is_refused_before_it_runs(twenty: Path, monkeypatch: pytest.MonkeyPatch):
+    made = Run.open(twenty).trainer()
+    monkeypatch.setattr(trainer, "memory_free", lambda: 1000)
+    for call in (made.check, made.start, made.advance):
+        assert re.search(r"takes 0.0 GB.* and 0.0 GB are free: choose a smaller", said(call))
+
+
+def test_an_evaluation_says_how_long_it_takes_still(twenty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """20 targets a chunk, of which the second and third take a second each."""
+    folder, notes, clock = copy(twenty, tmp_path / "run"), list[str](), itertools.count(100.0)
+    (folder / "evaluations.json").unlink()
+    told = Told()
+    told.update = lambda done, note="": notes.append(note)
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    resume(edit(folder, **{"evaluate.targets": 80}), told)
+    shown = [f"evaluating {done}/80 targets" for done in (0, 20, 40, 60, 80)]
+    assert notes[-5:] == [shown[0], shown[1], f"{shown[2]}, 2 s left", f"{shown[3]}, 1 s left", shown[4]]

@@ -15,7 +15,7 @@ import cv2
 import jax
 import numpy as np
 
-from arm5dof.runtime import xla
+from arm5dof.runtime import forks, xla
 from arm5dof.vision.boxes import mirror, nms
 from arm5dof.vision.detections import Detections, check_thresholds
 from arm5dof.vision.detectors.tabletop.crops import boxes_to_image, crop, crop_squares
@@ -76,6 +76,7 @@ class TabletopDetector:
 
     def __call__(self, image: np.ndarray) -> Detections:
         """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
+        forks.check()
         boxed = letterbox(rgb(image), INPUT_SIZE)
         refine_here = partial(refine, self._params["refiner"], boxed.image)
         proposed, objectness = self._propose(self._params["proposer"], boxed.image)

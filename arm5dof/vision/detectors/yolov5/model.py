@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from arm5dof.errors import UserError
-from arm5dof.runtime import xla
+from arm5dof.runtime import forks, xla
 from arm5dof.vision.detections import Detections, check_thresholds
 from arm5dof.vision.detectors.yolov5.layers import C3, SPPF, Bottleneck, Concat, Conv, Detect, Network, Upsample
 from arm5dof.vision.detectors.yolov5.pt_reader import Module, read_pt
@@ -167,6 +167,7 @@ class YOLOv5:
 
     def __call__(self, image: np.ndarray) -> Detections:
         """What is in an image (h, w, 3), RGB uint8 or anything else that `images.rgb` takes."""
+        forks.check()
         boxed = letterbox(rgb(image), (self._size, self._size), None if self._square else self._stride)
         boxes, scores = (np.asarray(x) for x in self.forward(boxed.image))
         found = Detections.from_scores(boxes, scores, self.class_names, self._confidence, self._iou)
