@@ -50,6 +50,18 @@ def board_remedy() -> Iterator[None]:
         raise UserError(f"{error}: give --board {error.size}") from None
 
 
+@contextmanager
+def lens_remedy() -> Iterator[None]:
+    """Where photographs fit another lens model, say how to ask for it."""
+    from arm5dof.vision.calibration.intrinsics import LensError
+
+    try:
+        yield
+    except LensError as error:
+        option = "--lens fisheye" if error.lens == "fisheye" else f"--distortion {error.coefficients}"
+        raise UserError(f"{error}: give {option}") from None
+
+
 def writable(path: Path, suffixes: tuple[str, ...]) -> None:
     """Say what is wrong with an output's name before the work begins."""
     if path.suffix.lower() not in suffixes:

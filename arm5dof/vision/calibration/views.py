@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration.boards import Board, Corners
 from arm5dof.vision.calibration.poses import pose_matrix
 from arm5dof.vision.camera import Camera
+from arm5dof.vision.lens import Projection
 
 MIN_VIEWS = 5
 """Different views that a calibration takes. OpenCV's 13 photographs give the focal length to 0.1 % from any five of
@@ -87,19 +89,29 @@ def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
     Returns:
         Board to camera frame, (4, 4), metres.
     """
-    lens = camera.opencv
+    plane = camera.model.normalize(corners.pixels, camera.opencv)
     # A flat board has two poses that look alike; the first is the one with the smaller error.
-    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, corners.pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
-    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, *lens, turns[0], shifts[0])
-    return pose_matrix(cv2.Rodrigues(turn)[0], shift.ravel())
+    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, plane, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+
+    def project(pose: np.ndarray) -> Projection:
+        return camera.model.project(corners.points, pose[:3], pose[3:], camera.opencv)
+
+    found = least_squares(
+        lambda pose: (project(pose).pixels - corners.pixels).ravel(),
+        np.concatenate([turns[0], shifts[0]]).ravel(),
+        lambda pose: project(pose).by_pose,
+        method="lm",
+        xtol=1e-12,
+    )
+    return pose_matrix(cv2.Rodrigues(found.x[:3])[0], found.x[3:])
 
 
 def board_error(camera: Camera, corners: Corners) -> float:
     """Root mean square reprojection error of a view with the best pose, pixels."""
     pose = board_pose(camera, corners)
     turn, _ = cv2.Rodrigues(pose[:3, :3])
-    pixels, _ = cv2.projectPoints(corners.points, turn, pose[:3, 3], *camera.opencv)
-    return float(np.sqrt(np.square(pixels[:, 0] - corners.pixels).sum(-1).mean()))
+    pixels = camera.model.project(corners.points, turn, pose[:3, 3], camera.opencv).pixels
+    return float(np.sqrt(np.square(pixels - corners.pixels).sum(-1).mean()))
 
 
 def _one_size(sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
