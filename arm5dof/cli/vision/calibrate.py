@@ -67,6 +67,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
     paths = image_files(args.images)
     board = options.board(args.board, args.square, args.charuco, args.dictionary)
+    options.say_untagged(paths)
     with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
         views = find_views(paths, board, progress)
     with options.lens_remedy():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,6 +36,20 @@ def board(size: tuple[int, int], square: float, marker: float | None, dictionary
     if dictionary is not None:
         raise UserError("--dictionary belongs to a ChArUco board: give the side of its markers with --charuco")
     return Checkerboard(*size, square)
+
+
+def say_untagged(paths: Iterable[Path]) -> None:
+    """Say in one line that EXIF orientation tags are ignored, if any of these photographs has one."""
+    from arm5dof.vision.images import has_orientation
+
+    tagged = [path for path in paths if has_orientation(path)]
+    if tagged:
+        more = f" and {len(tagged) - 1} more" if len(tagged) > 1 else ""
+        print(
+            f"arm5dof: the orientation tag of {tagged[0]}{more} is ignored: a camera model belongs to the "
+            "sensor's pixels",
+            file=sys.stderr,
+        )
 
 
 @contextmanager

@@ -228,7 +228,7 @@ def preview(path: Path, camera: Camera, suffix: str = ".png") -> bytes:
     Returns:
         The content of such a file: the photograph as it is and, beside it, without its lens distortion.
     """
-    image = cv2.cvtColor(images.read(path), cv2.COLOR_RGB2BGR)
+    image = cv2.cvtColor(images.read(path, upright=False), cv2.COLOR_RGB2BGR)
     straight = camera.model.straighten(image, camera.opencv)
     return cv2.imencode(suffix, np.concatenate([image, straight], axis=1))[1].tobytes()
 

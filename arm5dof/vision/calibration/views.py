@@ -132,9 +132,10 @@ def image_names(paths: Sequence[Path]) -> list[str]:
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """A photograph in gray, (h, w), uint8. Raises `UserError` if it is none."""
+    """A photograph in gray as the sensor saw it, whatever its EXIF orientation tag says, (h, w), uint8. Raises
+    `UserError` if it is none."""
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    gray = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    gray = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if content.size else None
     if gray is None:
         raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
     return gray
