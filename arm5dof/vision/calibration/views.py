@@ -9,17 +9,19 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration.boards import Board, Corners
 from arm5dof.vision.calibration.poses import pose_matrix
 from arm5dof.vision.camera import Camera
-from arm5dof.vision.lens import Projection
 
 MIN_VIEWS = 5
 """Different views that a calibration takes. OpenCV's 13 photographs give the focal length to 0.1 % from any five of
 them, and to between 0.1 and 2 % from two or three."""
+
+
+STEPS = 20
+"""At most, to the pose of a board; four are usual."""
 
 
 class BoardView(NamedTuple):
@@ -92,18 +94,22 @@ def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
     plane = camera.model.normalize(corners.pixels, camera.opencv)
     # A flat board has two poses that look alike; the first is the one with the smaller error.
     _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, plane, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-
-    def project(pose: np.ndarray) -> Projection:
-        return camera.model.project(corners.points, pose[:3], pose[3:], camera.opencv)
-
-    found = least_squares(
-        lambda pose: (project(pose).pixels - corners.pixels).ravel(),
-        np.concatenate([turns[0], shifts[0]]).ravel(),
-        lambda pose: project(pose).by_pose,
-        method="lm",
-        xtol=1e-12,
-    )
-    return pose_matrix(cv2.Rodrigues(found.x[:3])[0], found.x[3:])
+    pose = np.concatenate([turns[0], shifts[0]]).ravel()
+    seen = camera.model.project(corners.points, pose[:3], pose[3:], camera.opencv)
+    for _ in range(STEPS):  # Gauss-Newton steps on the pixels, halved until they lead downhill.
+        step = np.linalg.lstsq(seen.by_pose, (corners.pixels - seen.pixels).ravel(), rcond=None)[0]
+        for _ in range(STEPS):
+            moved = pose + step
+            again = camera.model.project(corners.points, moved[:3], moved[3:], camera.opencv)
+            if np.linalg.norm(again.pixels - corners.pixels) < np.linalg.norm(seen.pixels - corners.pixels):
+                break
+            step = step / 2
+        else:
+            break
+        pose, seen = moved, again
+        if np.abs(step).max() < 1e-7:
+            break
+    return pose_matrix(cv2.Rodrigues(pose[:3])[0], pose[3:])
 
 
 def board_error(camera: Camera, corners: Corners) -> float:
