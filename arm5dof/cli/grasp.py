@@ -147,6 +147,7 @@ def _watched(program: Program, video: Path | None, quiet: bool) -> Trial:
 def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, float]) -> int:
     """Plan for a photograph, and print what an arm would be told."""
     from arm5dof.arm import load_arm
+    from arm5dof.cli.vision.options import say_untagged
     from arm5dof.grasp.grasper import Grasper
     from arm5dof.grasp.gripper import SITE
     from arm5dof.grasp.perception import CameraPerception, detectors
@@ -161,7 +162,8 @@ def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, floa
         raise UserError("--image wants --pick CLASS: what is to be picked")
     camera = Camera.load(args.camera)
     quick, thorough = (CameraPerception(detector, camera) for detector in detectors())
-    image = images.read(args.image)
+    say_untagged([args.image])
+    image = images.read(args.image, upright=False)
     arm = load_arm(args.arm, SITE)
     planner = Planner(load_policy(policy), arm)
     rest = World(arm).rest(camera, radii)

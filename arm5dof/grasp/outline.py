@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import cache
 
-import cv2
 import mujoco
 import numpy as np
 
@@ -32,7 +31,7 @@ def size_misfit(name: str, xyxy: np.ndarray, position: np.ndarray, camera: Camer
     """
     to_camera = np.asarray(camera.rotation, float).T
     local = (_surface(CLASS_NAMES.index(name)) + position - np.asarray(camera.position, float)) @ to_camera.T
-    pixels, _ = cv2.projectPoints(local.reshape(-1, 3), np.zeros(3), np.zeros(3), *camera.opencv)
+    pixels = camera.model.project(local.reshape(-1, 3), np.zeros(3), np.zeros(3), camera.opencv).pixels
     expected = np.ptp(pixels.reshape(*local.shape[:2], 2), axis=1)
     found = np.asarray(xyxy[2:], float) - xyxy[:2]
     return float(np.abs(np.log(found / expected)).max(1).min())

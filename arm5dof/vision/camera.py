@@ -1,4 +1,4 @@
-"""`Camera`: a pinhole camera with OpenCV's lens distortion and a pose in the arm's base frame.
+"""`Camera`: a camera with one of OpenCV's lens models and a pose in the arm's base frame.
 
 Frames follow OpenCV: x right, y down, z forward along the optical axis; the center of the top left pixel is (0, 0).
 MuJoCo's convention (y up, looking along -z) is converted in `Camera.from_mujoco` and nowhere else.
@@ -18,11 +18,7 @@ from flax import struct
 
 from arm5dof.errors import UserError
 from arm5dof.vision import camera_file
-
-Array = jax.Array | np.ndarray
-
-NEWTON_STEPS = 10
-"""Enough for float64 wherever the lens model can be inverted: Newton converges from one side, then quadratically."""
+from arm5dof.vision.lens import LENSES, Array, Lens, slopes, split, undistort
 
 OPENCV_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 
@@ -45,7 +41,7 @@ class Camera(struct.PyTreeNode):
     matrix: Array
     """Focal lengths and principal point, (3, 3), pixels."""
     distortion: Array
-    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], (4,), (5,) or (8,)."""
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], (4,), (5,) or (8,); of a fisheye lens k1 k2 k3 k4, (4,)."""
     rotation: Array
     """Camera to base frame, (3, 3)."""
     position: Array
@@ -59,19 +55,26 @@ class Camera(struct.PyTreeNode):
     what is computed from them is in that frame."""
     covariance: Array | None = None
     """Of the parameters, (m, m), in the order in which `perturbed` takes errors; None if unknown."""
+    lens: str = struct.field(pytree_node=False, default="pinhole")
+    """The lens model: `pinhole`, OpenCV's usual one, or `fisheye`."""
 
     def __post_init__(self) -> None:
+        if self.lens not in LENSES:
+            raise UserError(f"no lens model {self.lens!r}: choose from {', '.join(LENSES)}")
         # Transformations build cameras out of whatever they put in place of arrays; only arrays have a shape to check.
         shape = getattr(self.distortion, "shape", ())
-        if shape and shape[-1] not in camera_file.COEFFICIENTS:
-            raise UserError(
-                f"{shape[-1]} distortion coefficients: give 4, 5 or 8 in OpenCV's order, k1 k2 p1 p2 [k3 [k4 k5 k6]]; "
-                "calibrate without OpenCV's thin prism and tilted models"
-            )
+        if shape and shape[-1] not in self.model.counts:
+            raise UserError(f"{shape[-1]} distortion coefficients: give {self.model.wanted}")
+
+    @property
+    def model(self) -> Lens:
+        """The lens model itself."""
+        return LENSES[self.lens]
 
     @property
     def opencv(self) -> tuple[np.ndarray, np.ndarray]:
-        """`matrix` (3, 3) and `distortion` (4, 5 or 8,), float64, as OpenCV's functions take them."""
+        """`matrix` (3, 3) and `distortion` (4, 5 or 8,), float64, as OpenCV's functions take them; for a fisheye lens
+        those of `cv2.fisheye`."""
         return np.asarray(self.matrix, float), np.asarray(self.distortion, float)
 
     def with_pose(self, rotation: Array, position: Array) -> Camera:
@@ -123,17 +126,18 @@ class Camera(struct.PyTreeNode):
     @jax.jit
     def project(self, points: Array) -> jax.Array:
         """Where points are seen. As with OpenCV's, a pixel says nothing about whether it lies in the image; far outside
-        the field of view a barrel distortion folds back, and a point there may be given a pixel inside.
+        the field of view a pinhole's barrel distortion folds back, and a point there may be given a pixel inside.
 
         Args:
             points: (..., 3), metres, base frame.
 
         Returns:
-            Pixels (..., 2), x and y; NaN for points that are not in front of the camera.
+            Pixels (..., 2), x and y; NaN for points that are not in front of the camera, or that a fisheye lens cannot
+            show.
         """
-        x, y, z = _split(self.to_camera(points))
+        x, y, z = split(self.to_camera(points))
         depth = jnp.where(z > 0, z, 1.0)  # Keeps the gradient of the points in front free of NaN.
-        pixels = self._to_pixels(self._distort(jnp.stack([x / depth, y / depth], -1)))
+        pixels = self._show(jnp.stack([x / depth, y / depth], -1))
         return jnp.where(z[..., None] > 0, pixels, jnp.nan)
 
     @jax.jit
@@ -178,49 +182,37 @@ class Camera(struct.PyTreeNode):
         point = jnp.concatenate([plane, jnp.ones_like(plane[..., :1])], -1) * jnp.asarray(depth)[..., None]
         return _matmul(point, jnp.asarray(self.rotation).T) + self.position
 
+    @jax.jit
+    def magnification(self, points: Array) -> jax.Array:
+        """How pixels follow a point that moves across the line of sight.
+
+        Args:
+            points: (..., 3), metres, base frame.
+
+        Returns:
+            (..., 2, 2): derivative of the pixel's x and y (rows) by the point's x and y on the image plane at depth 1
+            (columns). NaN for points not in front of the camera.
+        """
+        x, y, z = split(self.to_camera(points))
+        depth = jnp.where(z > 0, z, jnp.nan)
+        return jnp.stack(slopes(self._show, jnp.stack([x / depth, y / depth], -1))[1:], -1)
+
+    def _show(self, plane: jax.Array) -> jax.Array:
+        """Pixels (..., 2) at which the lens shows points (..., 2) of the image plane at depth 1."""
+        return self._to_pixels(self.model.distort(self.distortion, plane))
+
     def _to_pixels(self, plane: jax.Array) -> jax.Array:
         """Pixels (..., 2) of points (..., 2) on the image plane at depth 1."""
-        x, y = _split(plane)
+        x, y = split(plane)
         (fx, skew, cx), (_, fy, cy) = self.matrix[0], self.matrix[1]
         return jnp.stack([fx * x + skew * y + cx, fy * y + cy], -1)
 
     def _normalize(self, pixels: Array) -> jax.Array:
-        """Undistorted points (..., 2) on the image plane at depth 1, by Newton's method on `_distort`."""
-        u, v = _split(jnp.asarray(pixels))
+        """Undistorted points (..., 2) on the image plane at depth 1."""
+        u, v = split(jnp.asarray(pixels))
         (fx, skew, cx), (_, fy, cy) = self.matrix[0], self.matrix[1]
         y = (v - cy) / fy
-        target = jnp.stack([(u - cx - skew * y) / fx, y], -1)
-        start = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, p: self._newton(p, target), target)
-        # The last step alone carries the gradient: it is that of the implicit function, whatever came before.
-        plane = self._newton(jax.lax.stop_gradient(start), target)
-        error = jnp.linalg.norm(self._distort(plane) - target, axis=-1, keepdims=True)
-        tolerance = 1e-5 * (1 + jnp.linalg.norm(target, axis=-1, keepdims=True))
-        # Past where a barrel distortion folds back, the way back leads to the other side of the image.
-        ahead = jnp.sum(plane * target, axis=-1, keepdims=True) >= 0
-        return jnp.where((error < tolerance) & ahead, plane, jnp.nan)
-
-    def _newton(self, plane: jax.Array, target: jax.Array) -> jax.Array:
-        """One Newton step from `plane` towards the point that `_distort` takes to `target`, (..., 2) each."""
-        one, zero = jnp.ones_like(plane[..., 0]), jnp.zeros_like(plane[..., 0])
-        found, along_x = jax.jvp(self._distort, (plane,), (jnp.stack([one, zero], -1),))
-        _, along_y = jax.jvp(self._distort, (plane,), (jnp.stack([zero, one], -1),))
-        (a, c), (b, d), (e, f) = _split(along_x), _split(along_y), _split(target - found)
-        return plane + jnp.stack([d * e - b * f, a * f - c * e], -1) / (a * d - b * c)[..., None]
-
-    def _distort(self, plane: jax.Array) -> jax.Array:
-        """OpenCV's lens model on points (..., 2) of the image plane at depth 1 (documentation of its calib3d)."""
-        given = [self.distortion[i] for i in range(self.distortion.shape[0])]
-        k1, k2, p1, p2, k3, k4, k5, k6 = given + [0.0] * (8 - len(given))
-        x, y = _split(plane)
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        return jnp.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            -1,
-        )
+        return undistort(self.model, self.distortion, jnp.stack([(u - cx - skew * y) / fx, y], -1))
 
     @classmethod
     def from_mujoco(
@@ -296,6 +288,7 @@ class Camera(struct.PyTreeNode):
         values = {
             "image_width": self.width,
             "image_height": self.height,
+            **camera_file.model_notes(self.model, len(self.distortion)),
             "camera_matrix": np.asarray(self.matrix, float),
             "distortion_coefficients": np.asarray(self.distortion, float).reshape(-1, 1),
         }
@@ -305,10 +298,6 @@ class Camera(struct.PyTreeNode):
         if self.covariance is not None:
             values["camera_covariance"] = np.asarray(self.covariance, float)
         camera_file.write(Path(path), {**values, **(notes or {})})
-
-
-def _split(array: jax.Array) -> list[jax.Array]:
-    return [array[..., i] for i in range(array.shape[-1])]
 
 
 def _matmul(points: jax.Array, matrix: Array) -> jax.Array:

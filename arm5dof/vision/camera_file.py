@@ -1,4 +1,4 @@
-"""Camera files: YAML as OpenCV's calibration sample writes it, to which ours add the pose and the covariance."""
+"""Camera files: YAML as OpenCV's calibration sample or ROS writes it, to which ours add the pose and the covariance."""
 
 from __future__ import annotations
 
@@ -11,9 +11,16 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
+from arm5dof.vision.lens import LENSES, Lens
 
-COEFFICIENTS = (4, 5, 8)
-"""How many distortion coefficients a camera may have: k1 k2 p1 p2 [k3 [k4 k5 k6]], in OpenCV's order."""
+KNOWN_MODELS = {
+    "fisheye_model": {"0": "pinhole", "1": "fisheye"},
+    "distortion_model": {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye"},
+}
+"""Our names of lens models by what OpenCV's calibration sample says of them, and ROS."""
+
+OTHER_MODELS = ("lens_model", "model_type", "projection_model", "xi")
+"""What a file says only if its lens model is another: `xi` is the mirror of OpenCV's omnidirectional one."""
 
 
 def read(path: Path, hand: np.ndarray | None = None) -> dict[str, Any]:
@@ -36,8 +43,9 @@ def read(path: Path, hand: np.ndarray | None = None) -> dict[str, Any]:
     distortion = _array(path, values, "distortion_coefficients", None)
     if (matrix[2] != (0, 0, 1)).any() or matrix[1, 0] or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise UserError(f"{path}: camera_matrix is not of the form [fx s cx; 0 fy cy; 0 0 1]")
-    if distortion.size not in COEFFICIENTS:
-        raise UserError(f"{path} has {distortion.size} distortion_coefficients: 4, 5 or 8 can be used")
+    lens = _lens(path, values)
+    if distortion.size not in LENSES[lens].counts:
+        raise UserError(f"{path} has {distortion.size} distortion_coefficients: give {LENSES[lens].wanted}")
     width, height = (_positive_integer(path, values, name) for name in ("image_width", "image_height"))
     mount = "camera" if hand is None else "hand"
     has_extrinsics = f"{mount}_rotation" in values
@@ -58,7 +66,15 @@ def read(path: Path, hand: np.ndarray | None = None) -> dict[str, Any]:
         "height": height,
         "has_extrinsics": has_extrinsics,
         "covariance": _covariance(path, values, 10 + distortion.size),
+        "lens": lens,
     }
+
+
+def model_notes(lens: Lens, coefficients: int) -> dict[str, Any]:
+    """What says in a camera file which lens model it is, to OpenCV's calibration sample and to ROS."""
+    if lens.name == "fisheye":
+        return {"fisheye_model": 1, "distortion_model": "equidistant"}
+    return {"fisheye_model": 0, "distortion_model": "plumb_bob" if coefficients <= 5 else "rational_polynomial"}
 
 
 def write(path: Path, values: Mapping[str, Any]) -> None:
@@ -70,15 +86,40 @@ def write(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    """Everything at the top level of one of OpenCV's YAML files but strings: numbers and arrays by name."""
+    """What is at the top level of one of OpenCV's or ROS's YAML files: numbers, strings and arrays by name."""
     try:
         text = path.read_text(encoding="utf-8")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
-        nodes = {name: root.getNode(name) for name in root.keys()}  # noqa: SIM118
-        return {n: node.mat() if node.isMap() else node.real() for n, node in nodes.items() if not node.isString()}
+        return {name: _value(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
     except (cv2.error, UnicodeDecodeError, SystemError):
-        raise UserError(f"{path} is no camera file: give a YAML file of OpenCV's, or one that we wrote") from None
+        raise UserError(f"{path} is no camera file: give a YAML file of OpenCV's or ROS's, or one of ours") from None
+
+
+def _value(node: cv2.FileNode) -> Any:
+    if node.isString():
+        return node.string()
+    if not node.isMap():
+        return node.real()
+    if "dt" in node.keys():  # noqa: SIM118
+        return node.mat()
+    numbers = node.getNode("data")  # ROS leaves out of what type they are.
+    return np.array([numbers.at(i).real() for i in range(numbers.size())])
+
+
+def _lens(path: Path, values: dict[str, Any]) -> str:
+    """The lens model of a camera file: OpenCV's usual one unless it says something else."""
+    said = {name: _word(values[name]) for name in (*KNOWN_MODELS, *OTHER_MODELS) if _word(values.get(name, ""))}
+    lenses = {KNOWN_MODELS.get(name, {}).get(word) for name, word in said.items()}
+    if lenses <= {"pinhole"} or lenses == {"fisheye"}:
+        return "fisheye" if "fisheye" in lenses else "pinhole"
+    words = " and ".join(f"{name} {word}" for name, word in said.items())
+    known = "; ".join(f"{name} {', '.join(words)}" for name, words in KNOWN_MODELS.items())
+    raise UserError(f"{path} says {words}, which is no lens model that is known: calibrate with one that is ({known})")
+
+
+def _word(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _array(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ...] | None) -> np.ndarray:

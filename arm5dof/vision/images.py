@@ -14,15 +14,20 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision.opencv import quiet
 
+ORIENTATION_TAG = 0x0112
+"""Of EXIF."""
+
 GREY = 114
 """The borders of a letterboxed image, as YOLO networks were trained with."""
 
 
-def read(path: str | Path) -> np.ndarray:
-    """Read an image file, and turn it upright if its EXIF data say so.
+def read(path: str | Path, upright: bool = True) -> np.ndarray:
+    """Read an image file.
 
     Args:
         path: A file of any format that OpenCV reads.
+        upright: Turn it as its EXIF orientation tag says. Where a camera model is used, do not: that belongs to the
+            sensor's pixels.
 
     Returns:
         RGB uint8 (h, w, 3).
@@ -34,9 +39,10 @@ def read(path: str | Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"no image {path}: give the path of an image file")
     content = np.frombuffer(path.read_bytes(), np.uint8)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
     try:
         with quiet():
-            pixels = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if content.size else None
+            pixels = cv2.imdecode(content, flags) if content.size else None
     except cv2.error:
         pixels = None
     if pixels is None:
@@ -45,6 +51,17 @@ def read(path: str | Path) -> np.ndarray:
         return rgb(pixels[..., ::-1])
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
+
+
+def has_orientation(path: str | Path) -> bool:
+    """Whether an image file has an EXIF tag that says to turn or mirror it; not if it is no image."""
+    from PIL import Image  # Takes its time to import.
+
+    try:
+        with Image.open(path) as image:
+            return image.getexif().get(ORIENTATION_TAG, 1) in range(2, 9)
+    except Exception:  # Whatever is wrong with it, who reads the image will say.
+        return False
 
 
 def rgb(array: np.ndarray) -> np.ndarray:

@@ -308,7 +308,7 @@ def test_files_that_are_no_cameras_are_one_line(tmp_path):
         ({"image_width": 0}, "no image_width"),
         ({"image_height": "wide"}, "no image_height"),
         ({"image_height": 4.5}, "no image_height"),
-        ({"distortion_coefficients": np.zeros(6)}, "6 distortion_coefficients: 4, 5 or 8"),
+        ({"distortion_coefficients": np.zeros(6)}, "6 distortion_coefficients: give 4, 5 or 8"),
         ({"camera_rotation": np.diag([1, 1, -1.0])}, "no rotation matrix"),
         ({"camera_rotation": 1.001 * np.eye(3)}, "no rotation matrix"),
         ({"camera_position": None}, "no camera_position"),

@@ -37,6 +37,11 @@ def test_photographs_are_turned_upright(tmp_path):
     Image.fromarray(pixels).save(tmp_path / "turned.jpg", exif=exif)
     image = images.read(tmp_path / "turned.jpg")
     assert image.shape == (32, 16, 3) and image[:12].min() > 200 and image[20:].max() < 50
+    assert images.read(tmp_path / "turned.jpg", upright=False).shape == (16, 32, 3)
+    Image.fromarray(pixels).save(tmp_path / "plain.jpg")
+    assert images.has_orientation(tmp_path / "turned.jpg") and not images.has_orientation(tmp_path / "plain.jpg")
+    (tmp_path / "words.jpg").write_text("hello")
+    assert not images.has_orientation(tmp_path / "words.jpg")
 
 
 def test_ranges_meet_at_both_ends_and_round():

@@ -25,11 +25,13 @@ middle and in the corners of the image. Do not move zoom or focus between them.
   arm5dof vision calibrate photos/ --board 9x6 --square 0.025 --out camera.yml
   arm5dof vision calibrate *.jpg --board 9x6 --square 0.025 --out camera.yml --preview straight.png
   arm5dof vision calibrate photos/ --board 8x6 --square 0.03 --charuco 0.022 --out camera.yml
+  arm5dof vision calibrate photos/ --board 9x6 --square 0.025 --lens fisheye --out camera.yml
 
 A checkerboard is counted in inner corners, where four squares meet: one of 10 x 7 squares has 9x6. A ChArUco board is
 counted in squares. The result goes into a YAML file in OpenCV's format. Judge it by the +- of the intrinsics rather
 than by the error in pixels: few photographs fit well and say little. Exit status 2, and nothing written, if the
-photographs are too few, show another board, or leave the intrinsics uncertain.
+photographs are too few, show another board, leave the intrinsics uncertain, or were taken by a lens that another model
+describes much better: that of --lens fisheye, or eight coefficients, which wide lenses want.
 """
 
 
@@ -42,9 +44,9 @@ def declare(commands: argparse._SubParsersAction) -> None:
         "--distortion",
         type=int,
         choices=(4, 5, 8),
-        default=5,
-        help="how many coefficients to estimate; default 5, 8 for wide lenses",
+        help="how many coefficients to estimate; default 5, 8 for wide lenses; 4 of a fisheye lens",
     )
+    p.add_argument("--lens", choices=("pinhole", "fisheye"), default="pinhole", help="lens model; default pinhole")
     p.add_argument("--out", type=Path, required=True, metavar="CAMERA.yml", help="where the camera goes")
     p.add_argument("--preview", type=Path, metavar="OUT.png", help="a photograph before and after undistortion")
     p.add_argument("--json", action="store_true", help="print one JSON object")
@@ -65,9 +67,11 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
     paths = image_files(args.images)
     board = options.board(args.board, args.square, args.charuco, args.dictionary)
+    options.say_untagged(paths)
     with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
         views = find_views(paths, board, progress)
-    result = calibrate(views, args.distortion)
+    with options.lens_remedy():
+        result = calibrate(views, args.distortion, args.lens)
     # Both files or none: the preview takes its place when the camera has been written.
     with ExitStack() as stack:
         if args.preview is not None:
@@ -83,8 +87,6 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
 def calibration_table(views: BoardViews, result: Calibration) -> str:
     """What a calibration found, for people."""
-    from arm5dof.vision.calibration.intrinsics import INTRINSICS
-
     width = max(len(name) for name in [*result.errors, *result.outliers, *result.copies, *views.without, "photograph"])
     lines = [f"{'photograph':{width}}  error, pixels"]
     lines += [f"{name:{width}}  {error:.3f}" for name, error in result.errors.items()]
@@ -94,7 +96,7 @@ def calibration_table(views: BoardViews, result: Calibration) -> str:
     lines += [f"{name:{width}}  -      left out: the same as {first}" for name, first in result.copies.items()]
     lines += [f"{name:{width}}  -      left out: board not found" for name in views.without]
     lines += ["", f"{'intrinsic':{width}}  value +- standard deviation"]
-    for name, value, deviation in zip(INTRINSICS, result.intrinsics, result.deviations, strict=False):
+    for name, value, deviation in zip(result.names, result.intrinsics, result.deviations, strict=True):
         digits, unit = (2, " pixels") if name[0] in "fc" else (5, "")
         lines.append(f"{name:{width}}  {value:.{digits}f} +- {deviation:.{digits}f}{unit}")
     size = f"{result.camera.width}x{result.camera.height}"
@@ -103,15 +105,13 @@ def calibration_table(views: BoardViews, result: Calibration) -> str:
 
 def as_json(views: BoardViews, result: Calibration) -> dict[str, Any]:
     """The same for programs."""
-    from arm5dof.vision.calibration.intrinsics import INTRINSICS
-
     both = zip(result.intrinsics, result.deviations, strict=True)
     return {
         "image_size": [result.camera.width, result.camera.height],
         "rms_px": result.rms,
         "intrinsics": {
             name: {"value": float(value), "deviation": float(deviation)}
-            for name, (value, deviation) in zip(INTRINSICS, both, strict=False)
+            for name, (value, deviation) in zip(result.names, both, strict=True)
         },
         "errors_px": result.errors,
         "outliers_px": result.outliers,

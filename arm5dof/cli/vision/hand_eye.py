@@ -62,6 +62,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     hands, paths = read_hand_poses(args.poses)
     camera = Camera.load(args.camera)
     board = options.board(args.board, args.square, args.charuco, args.dictionary)
+    options.say_untagged(paths)
     with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
         found = from_hand(camera, hands, paths, board, args.eye_in_hand, progress)
     found.save(args.out, board)

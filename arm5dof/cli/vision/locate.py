@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arm5dof.cli.parser import nothing_left
-from arm5dof.cli.vision import detecting
+from arm5dof.cli.vision import detecting, options
 from arm5dof.errors import UserError, nearest
 from arm5dof.runtime import files
 
@@ -133,9 +133,9 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
 def _run_on_images(args: argparse.Namespace) -> int:
     """Detect in images, and locate what is found."""
     from arm5dof.vision.detectors.loading import is_tabletop
-    from arm5dof.vision.io.sources import open_source
+    from arm5dof.vision.io.sources import image_files, open_source
 
-    source = open_source(args.source)
+    source = open_source(args.source, upright=False)
     if source.has_cameras and (args.camera or args.hand or args.depth):
         raise UserError("simulated scenes come with their cameras: leave out --camera, --hand and --depth")
     if not source.has_cameras and len(args.camera) != 1:
@@ -144,6 +144,8 @@ def _run_on_images(args: argparse.Namespace) -> int:
     if args.depth and source.length != 1:
         raise UserError(f"{args.depth} is the depth image of one frame: give the one image that goes with it")
     cameras, locate = _load_cameras(args.camera, args.hand), _locator(args)
+    if source.rate is None and not source.has_cameras:
+        options.say_untagged(image_files([Path(given) for given in args.source]))
     if is_tabletop(args.detector):
         _warn_of_viewpoint(cameras, args.table)
 
@@ -258,6 +260,7 @@ def _load_cameras(paths: Sequence[Path], hand: Sequence[float] | None) -> list[C
 
 def _read_moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[str | None, list[Detections]]]:
     """The names of frames, and what was detected there in each camera's image."""
+    from arm5dof.vision.images import has_orientation
     from arm5dof.vision.io import detections_file
 
     views = [detections_file.read(path) for path in paths]
@@ -269,6 +272,11 @@ def _read_moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tupl
         for frame in frames:
             if frame.size is not None:
                 _check_size(frame.name, frame.size, camera)
+            if frame.name is not None and has_orientation(frame.name):
+                raise UserError(
+                    f"{frame.name} has an orientation tag, by which it was turned before it was detected in: give the "
+                    "photograph itself, as the sensor saw it, in place of its detections"
+                )
     moments = zip(*views, strict=True)
     return [(" + ".join(f.name for f in m if f.name) or None, [f.detections for f in m]) for m in moments]
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,6 +38,20 @@ def board(size: tuple[int, int], square: float, marker: float | None, dictionary
     return Checkerboard(*size, square)
 
 
+def say_untagged(paths: Iterable[Path]) -> None:
+    """Say in one line that EXIF orientation tags are ignored, if any of these photographs has one."""
+    from arm5dof.vision.images import has_orientation
+
+    tagged = [path for path in paths if has_orientation(path)]
+    if tagged:
+        more = f" and {len(tagged) - 1} more" if len(tagged) > 1 else ""
+        print(
+            f"arm5dof: the orientation tag of {tagged[0]}{more} is ignored: a camera model belongs to the "
+            "sensor's pixels",
+            file=sys.stderr,
+        )
+
+
 @contextmanager
 def board_remedy() -> Iterator[None]:
     """Where images show a checkerboard of another size, say how to ask for it."""
@@ -48,6 +63,18 @@ def board_remedy() -> Iterator[None]:
         if error.size is None:
             raise
         raise UserError(f"{error}: give --board {error.size}") from None
+
+
+@contextmanager
+def lens_remedy() -> Iterator[None]:
+    """Where photographs fit another lens model, say how to ask for it."""
+    from arm5dof.vision.calibration.intrinsics import LensError
+
+    try:
+        yield
+    except LensError as error:
+        option = "--lens fisheye" if error.lens == "fisheye" else f"--distortion {error.coefficients}"
+        raise UserError(f"{error}: give {option}") from None
 
 
 def writable(path: Path, suffixes: tuple[str, ...]) -> None:

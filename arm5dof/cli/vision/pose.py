@@ -65,6 +65,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     from arm5dof.vision.camera import Camera
 
     board = options.board(args.board, args.square, args.charuco, args.dictionary)
+    options.say_untagged([args.image])
     with options.board_remedy():
         camera = from_board(Camera.load(args.camera), args.image, board, board_to_base, placement_std)
     camera.save(args.out, {"board": str(board), "square_size": board.square})

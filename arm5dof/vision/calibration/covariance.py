@@ -101,16 +101,15 @@ def linearize(camera: Camera, corners: Corners, board: np.ndarray) -> tuple[np.n
     """What separates the n corners of a board at the pose `board` (4, 4) in the camera's frame from where they were
     seen, (2n,) pixels, and its derivative by the errors that `Camera.perturbed` takes, (2n, m)."""
     turn, _ = cv2.Rodrigues(board[:3, :3])
-    lens = camera.opencv
-    pixels, jacobian = cv2.projectPoints(corners.points, turn, board[:3, 3], *lens)
-    by_point = jacobian[:, 3:6].reshape(-1, 2, 3)
+    pixels, by_lens, by_place = camera.model.project(corners.points, turn, board[:3, 3], camera.opencv)
+    by_point = by_place[:, 3:].reshape(-1, 2, 3)
     x, y, z = (corners.points @ board[:3, :3].T + board[:3, 3]).T
     o = np.zeros_like(x)
     cross = np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
     # When the camera turns and shifts, what it sees does the opposite.
     by_pose = np.concatenate([by_point @ cross, -by_point], axis=2).reshape(-1, 6)
-    residual = (pixels[:, 0] - corners.pixels).ravel()
-    return residual, np.concatenate([jacobian[:, 6 : 10 + len(lens[1])], by_pose], axis=1)
+    residual = (pixels - corners.pixels).ravel()
+    return residual, np.concatenate([by_lens, by_pose], axis=1)
 
 
 def _step(start: np.ndarray, end: np.ndarray) -> np.ndarray:

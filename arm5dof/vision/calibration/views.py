@@ -24,6 +24,10 @@ MIN_VIEWS = 5
 them, and to between 0.1 and 2 % from two or three."""
 
 
+STEPS = 20
+"""At most, to the pose of a board; four are usual."""
+
+
 class BoardView(NamedTuple):
     """A board in a photograph."""
 
@@ -122,19 +126,33 @@ def board_pose(camera: Camera, corners: Corners) -> np.ndarray:
     Returns:
         Board to camera frame, (4, 4), metres.
     """
-    lens = camera.opencv
+    plane = camera.model.normalize(corners.pixels, camera.opencv)
     # A flat board has two poses that look alike; the first is the one with the smaller error.
-    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, corners.pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
-    turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, *lens, turns[0], shifts[0])
-    return pose_matrix(cv2.Rodrigues(turn)[0], shift.ravel())
+    _, turns, shifts, _ = cv2.solvePnPGeneric(corners.points, plane, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    pose = np.concatenate([turns[0], shifts[0]]).ravel()
+    seen = camera.model.project(corners.points, pose[:3], pose[3:], camera.opencv)
+    for _ in range(STEPS):  # Gauss-Newton steps on the pixels, halved until they lead downhill.
+        step = np.linalg.lstsq(seen.by_pose, (corners.pixels - seen.pixels).ravel(), rcond=None)[0]
+        for _ in range(STEPS):
+            moved = pose + step
+            again = camera.model.project(corners.points, moved[:3], moved[3:], camera.opencv)
+            if np.linalg.norm(again.pixels - corners.pixels) < np.linalg.norm(seen.pixels - corners.pixels):
+                break
+            step = step / 2
+        else:
+            break
+        pose, seen = moved, again
+        if np.abs(step).max() < 1e-7:
+            break
+    return pose_matrix(cv2.Rodrigues(pose[:3])[0], pose[3:])
 
 
 def board_error(camera: Camera, corners: Corners) -> float:
     """Root mean square reprojection error of a view with the best pose, pixels."""
     pose = board_pose(camera, corners)
     turn, _ = cv2.Rodrigues(pose[:3, :3])
-    pixels, _ = cv2.projectPoints(corners.points, turn, pose[:3, 3], *camera.opencv)
-    return float(np.sqrt(np.square(pixels[:, 0] - corners.pixels).sum(-1).mean()))
+    pixels = camera.model.project(corners.points, turn, pose[:3, 3], camera.opencv).pixels
+    return float(np.sqrt(np.square(pixels - corners.pixels).sum(-1).mean()))
 
 
 def _one_size(sizes: dict[str, tuple[int, int]]) -> tuple[int, int]:
@@ -155,10 +173,12 @@ def image_names(paths: Sequence[Path]) -> list[str]:
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """A photograph in gray, (h, w), uint8. Raises `UserError` if it is none."""
+    """A photograph in gray as the sensor saw it, whatever its EXIF orientation tag says, (h, w), uint8. Raises
+    `UserError` if it is none."""
     content = np.frombuffer(path.read_bytes(), np.uint8)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        gray = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+        gray = cv2.imdecode(content, flags) if content.size else None
     except cv2.error:  # Larger than OpenCV's limit, for instance.
         gray = None
     if gray is None:

@@ -69,6 +69,6 @@ def simulate_intrinsics(camera: Camera, rng: np.random.Generator) -> Camera:
 def _corners(camera: Camera, board: np.ndarray, rng: np.random.Generator) -> Corners:
     """The corners of a board at the pose `board` (4, 4) in the camera's frame."""
     turn, _ = cv2.Rodrigues(board[:3, :3])
-    pixels, _ = cv2.projectPoints(BOARD.points, turn, board[:3, 3], *camera.opencv)
+    pixels = camera.model.project(BOARD.points, turn, board[:3, 3], camera.opencv).pixels
     noise = CORNER_STD * rng.normal(size=(len(BOARD.points), 2))
-    return Corners(BOARD.points, (pixels[:, 0] + noise).astype(np.float32))
+    return Corners(BOARD.points, (pixels + noise).astype(np.float32))

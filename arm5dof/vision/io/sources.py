@@ -54,12 +54,13 @@ class Source:
     """Random scenes: each frame brings its camera, known exactly."""
 
 
-def open_source(given: Sequence[str]) -> Source:
+def open_source(given: Sequence[str], upright: bool = True) -> Source:
     """Open what is named.
 
     Args:
         given: The number of a camera, `simulated` or `simulated:N` for random scenes, a video file, or any number of
             photographs and folders of them.
+        upright: Turn photographs as their EXIF orientation tags say; not where a camera model is used.
 
     Returns:
         Its frames, and what is known of them beforehand.
@@ -78,7 +79,7 @@ def open_source(given: Sequence[str]) -> Source:
     videos = [path for path in paths if _is_video(path)]
     if videos and len(paths) > 1:
         raise UserError(f"{videos[0]} is no image: give one video by itself, or photographs and folders of them")
-    return video(videos[0]) if videos else photographs(image_files(paths))
+    return video(videos[0]) if videos else photographs(image_files(paths), upright)
 
 
 def image_files(given: Sequence[Path]) -> list[Path]:
@@ -107,9 +108,10 @@ def image_files(given: Sequence[Path]) -> list[Path]:
     return list(found)
 
 
-def photographs(paths: Sequence[Path]) -> Source:
-    """Image files, one after another. The frames raise `UserError` at one that is no image."""
-    return Source((Frame(str(path), images.read(path)) for path in paths), len(paths))
+def photographs(paths: Sequence[Path], upright: bool = True) -> Source:
+    """Image files, one after another, turned as their EXIF orientation tags say if they are to be
+    `upright`. The frames raise `UserError` at one that is no image."""
+    return Source((Frame(str(path), images.read(path, upright)) for path in paths), len(paths))
 
 
 def video(path: Path) -> Source:

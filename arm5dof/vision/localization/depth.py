@@ -129,7 +129,8 @@ def _by_depth(
             areas = (surface[:, 3:] / radii * jnp.prod(radii)) @ directions
             distance = camera.to_camera(center + away)[:, 2]
             facing = jnp.sum(areas * (camera.position - center - away), 1)
-            pieces = density * camera.matrix[0, 0] * camera.matrix[1, 1] * jnp.maximum(facing, 0) / distance**3
+            pixels = jnp.linalg.det(camera.magnification(center + away))
+            pieces = density * pixels * jnp.maximum(facing, 0) / distance**3
             shown = _look_up(depth, camera.project(center + away)) > distance - margin
             return _mean(cloud, taken) - _mean(away, jnp.where(shown, pieces, 0)), taken.sum() / pieces.sum()
 

@@ -1,7 +1,7 @@
 """`Solid`: what must be known of an object on the table to tell from its box in an image where it stands.
 
 That is its height, and whether it is a block, a ball or a cone. Its width is not needed: the box tells it. A solid here
-is the hull of two ellipsoids over one vertical axis, flat ones for the rims of a block, and its box in closed form: see
+is the hull of two ellipsoids over one vertical axis, flat ones for the rims of a block, whose outlines are known: see
 Cross and Zisserman (1998), "Quadric reconstruction from dual-space geometry". An ellipse stands in for any outline
 that half a turn leaves as it is.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +18,9 @@ import numpy as np
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Array, Camera
 from arm5dof.vision.objects import CATALOGUE
+
+AXES, SIGNS = np.array([0, 1, 0, 1]), np.array([-1, -1, 1, 1])
+"""Of the edges of a box: along which axis of the image, and whether they are the smallest or the largest there."""
 
 FORMS = {
     "block": np.array([[-1, 1, 0], [1, 1, 0]]),
@@ -89,22 +91,31 @@ def solid_box(
     wide, deep, high = jnp.moveaxis(sizes[:, :, None] * (directions @ camera.rotation), 1, 0)
     semiaxes = jnp.stack([wide + skew * deep, jnp.sqrt(1 - jnp.square(skew)) * deep, high], axis=1)
     shapes = semiaxes.transpose(0, 2, 1) @ semiaxes
-    (left, right), (top, bottom) = (jax.vmap(partial(_touching, axis), out_axes=1)(centers, shapes) for axis in (0, 1))
-    touching = jnp.stack([left, top, right, bottom])
-    pixels = camera.project(camera.position + touching @ jnp.asarray(camera.rotation).T) + 0.5
-    left, top, right, bottom = pixels[[0, 1, 2, 3], :, [0, 1, 0, 1]]
-    return jnp.stack([left.min(), top.min(), right.max(), bottom.max()])
+
+    def edges(ascent: jax.Array) -> jax.Array:
+        """Where both ellipsoids reach farthest, (4, 2, 3) in the base frame, if the edges' coordinates grow along
+        `ascent`, (4, 2, 2)."""
+        both = jax.vmap(_touching, (None, 0, 0, 0))
+        points = jax.vmap(both, (0, 0, None, None))(SIGNS, ascent, centers, shapes)
+        return jnp.asarray(camera.position) + points @ jnp.asarray(camera.rotation).T
+
+    # As a pinhole would show it first. Where a coordinate is extreme, just where matters to the second order only.
+    upright = edges(jnp.broadcast_to(np.eye(2)[AXES][:, None], (4, 2, 2)))
+    ascent = camera.magnification(jax.lax.stop_gradient(upright))[jnp.arange(4), :, AXES]
+    points = edges(jax.lax.stop_gradient(ascent))
+    pixels = camera.project(points)[jnp.arange(4), :, AXES] + 0.5
+    return jnp.where(SIGNS < 0, pixels.min(1), pixels.max(1))
 
 
-def _touching(axis: int, center: jax.Array, shape: jax.Array) -> jax.Array:
-    """Where the image of an ellipsoid, on the image plane at depth 1, touches the vertical lines (`axis` 0) or the
-    horizontal lines (1) around it: (2, 3) in the camera's frame, the smaller coordinate first. `center` (3,) is in the
-    camera's frame, `shape` (3, 3) the sum of the outer products of the semi-axes with themselves."""
-    # The plane through the camera and the line x = t has the normal l = (1, 0, -t) and touches the ellipsoid where
-    # (l . center)^2 = l . shape l, at the point shape l - (l . center) center.
-    c, z, s, sz, zz = center[axis], center[2], shape[axis, axis], shape[axis, 2], shape[2, 2]
+def _touching(sign: Array, ascent: jax.Array, center: jax.Array, shape: jax.Array) -> jax.Array:
+    """Where the image of an ellipsoid, on the image plane at depth 1, reaches farthest against (`sign` -1) or along (1)
+    a direction `ascent` (2,): (3,) in the camera's frame. `center` (3,) is in the camera's frame, `shape` (3, 3) the
+    sum of the outer products of the semi-axes with themselves."""
+    # The plane through the camera and the line ascent . (x, y) = t has the normal l = (ascent, -t) and touches the
+    # ellipsoid where (l . center)^2 = l . shape l, at the point shape l - (l . center) center.
+    along = jnp.append(ascent, 0.0)
+    c, z, s, sz, zz = along @ center, center[2], along @ shape @ along, along @ shape[2], shape[2, 2]
     root = jnp.sqrt(z * z * s - 2 * c * z * sz + c * c * zz + sz * sz - s * zz)
-    t = (c * z - sz + jnp.stack([-root, root])) / (z * z - zz)
-    normals = np.eye(3)[axis] - t[:, None] * np.eye(3)[2]
-    points = normals @ shape - (normals @ center)[:, None] * center
-    return jnp.where((z > 0) & (z * z > zz), points / points[:, 2:], jnp.nan)
+    normal = along.at[2].set(-(c * z - sz + sign * root) / (z * z - zz))
+    point = normal @ shape - (normal @ center) * center
+    return jnp.where((z > 0) & (z * z > zz), point / point[2], jnp.nan)

@@ -1,0 +1,56 @@
+"""EXIF orientation tags: a camera model belongs to the sensor's pixels, so they turn nothing where one is used."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from arm5dof.cli import main as cli
+from arm5dof.vision.camera import Camera
+
+
+@pytest.fixture
+def folder(test_data):
+    return test_data / "faults" / "10-exif-mixed"
+
+
+def command(*words):
+    return cli.main(["vision", *map(str, words)])
+
+
+BOARD = ["--board", "9x6", "--square", "0.02"]
+
+
+def test_half_the_photographs_tagged_move_nothing(folder, tmp_path, capfd):
+    """cx was 12 px and 12 deviations off, cy 10."""
+    assert command("calibrate", folder / "photos", *BOARD, "--out", tmp_path / "c.yml") == 0
+    error = capfd.readouterr().err
+    assert "v01.jpg and 7 more is ignored: a camera model belongs to the sensor's pixels" in error
+    camera = Camera.load(tmp_path / "c.yml")
+    found = np.array([camera.matrix[0, 0], camera.matrix[1, 1], *camera.matrix[:2, 2]])
+    assert (np.abs(found - [640, 641, 408.5, 292.5]) < 3 * np.sqrt(np.diag(camera.covariance)[:4])).all()
+
+
+def test_a_pose_is_the_same_with_and_without_the_tag(folder, tmp_path, capfd):
+    for name in ("upside_down", "same_view"):
+        out = tmp_path / f"{name}.yml"
+        image = folder / f"{name}.jpg"
+        assert command("pose", folder / "camera.yml", image, *BOARD, "--at", 0.1, 0.1, 0, 0, "--out", out) == 0
+        assert ("is ignored" in capfd.readouterr().err) == (name == "upside_down")
+    one, other = (Camera.load(tmp_path / f"{name}.yml") for name in ("upside_down", "same_view"))
+    np.testing.assert_allclose(one.position, other.position, atol=1e-4)
+
+
+def test_detections_in_a_turned_photograph_are_not_located(tmp_path, capfd):
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    path, camera = tmp_path / "a.jpg", tmp_path / "c.yml"
+    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(path, exif=exif)
+    matrix = np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1.0]])
+    Camera(matrix, np.zeros(5), np.diag([1.0, -1, -1]), np.array([0, 0, 0.5]), 64, 48).save(camera)
+    found = tmp_path / "found.json"
+    found.write_text(
+        f'[{{"name": "{path}", "time_s": null, "image_size": [64, 48], "detections": [{{"class_name": "cube", '
+        '"class_id": 0, "confidence": 0.9, "xyxy": [30, 20, 36, 26]}]}]'
+    )
+    assert command("locate", found, "--camera", camera, "--height", "cube=0.015") == 2
+    assert "a.jpg has an orientation tag, by which it was turned" in capfd.readouterr().err
