@@ -51,7 +51,7 @@ def read(path: Path) -> list[DetectedFrame]:
         if content and all("detections" in entry for entry in content):
             return [_frame(entry) for entry in content]
         return [DetectedFrame(None, None, _detections(content))]
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         raise UserError(f"{path} holds no detections: give the JSON that arm5dof vision detect writes") from None
 
 

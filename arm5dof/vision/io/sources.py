@@ -184,8 +184,7 @@ def read_depth(path: Path) -> np.ndarray:
         UserError: It is no such image.
         OSError: It cannot be read.
     """
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    pixels = images.decode(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise UserError(f"{path} is no depth image: give a PNG file with one channel of 16 bits, in millimetres")
     return pixels / 1000
