@@ -1,5 +1,5 @@
-"""Commands one after the other in one process, until one is refused. Each leaves a line of JSON: its status, what it
-printed and what it said."""
+"""Lists of commands one after the other in one process, each list until a command is refused. Each command leaves a
+line of JSON: the number of its list, its status, what it printed and what it said."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import traceback
 
 
 def main() -> None:
-    results, commands = os.dup(1), json.loads(sys.stdin.read())
-    for words in commands:
+    results, lists = os.dup(1), json.loads(sys.stdin.read())
+    over: set[int] = set()
+    for number, words in [(number, words) for number, commands in enumerate(lists) for words in commands]:
+        if number in over:
+            continue
         with tempfile.TemporaryFile(dir="/dev/shm") as printed, tempfile.TemporaryFile(dir="/dev/shm") as said:
             kept = os.dup(1), os.dup(2)
             os.dup2(printed.fileno(), 1)
@@ -33,9 +36,9 @@ def main() -> None:
             for file in (printed, said):
                 file.seek(0)
                 texts.append(file.read().decode(errors="replace"))
-        os.write(results, (json.dumps([status, *texts]) + "\n").encode())
+        os.write(results, (json.dumps([number, status, *texts]) + "\n").encode())
         if status not in (0, 1):
-            break
+            over.add(number)
 
 
 main()

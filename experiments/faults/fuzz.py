@@ -27,7 +27,7 @@ import psutil
 import readers
 
 PATIENCE_S = 10.0
-"""Of a processor, for one input; six times that by the clock, for other processes are there too."""
+"""Of a processor, for one input; twelve times that by the clock, for other processes are there too."""
 WARM_UP_S = 300.0
 """For the first input that a worker gets: programs are compiled."""
 MEMORY = 4 * 2**30
@@ -113,7 +113,7 @@ class Worker:
         if self.task is None:
             return None
         used, passed = self._cpu() - self._used, time.monotonic() - self._since
-        if max(used, passed / 6) < (WARM_UP_S if self.fresh else PATIENCE_S):
+        if max(used, passed / 12) < (WARM_UP_S if self.fresh else PATIENCE_S):
             return None
         self.process.kill()
         return self._ended("hang", f"{used:.0f} s of a processor, {passed:.0f} s by the clock")

@@ -59,28 +59,34 @@ def fingerprint(run: Path) -> dict[str, Any]:
     }
 
 
-def cycle(commands: Sequence[Sequence[str]], cwd: Path, env: dict[str, str], **more: Any) -> list[tuple[Any, str, str]]:
-    """Run commands in one process. Returns the status of each, what it printed and what it said."""
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("cycle.py"))],
-        **{
-            "cwd": cwd,
-            "env": env,
-            "stdin": subprocess.PIPE,
-            "stdout": subprocess.PIPE,
-            "stderr": subprocess.PIPE,
-            **more,
-        },
-    )
+Result = tuple[Any, str, str]
+"""The status of a command, what it printed and what it said."""
+
+
+def cycles(lists: Sequence[Sequence[Sequence[str]]], cwd: Path, env: dict[str, str], **more: Any) -> list[list[Result]]:
+    """Run lists of commands in one process, each list until a command is refused. Returns what came of each command."""
+    piped = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    command = [sys.executable, str(Path(__file__).with_name("cycle.py"))]
+    process = subprocess.Popen(command, **{"cwd": cwd, "env": env, **piped, **more})
     try:
-        printed, said = process.communicate(json.dumps(commands).encode(), LIMIT_S)
+        printed, said = process.communicate(json.dumps(lists).encode(), LIMIT_S * len(lists))
     except subprocess.TimeoutExpired:
         process.kill()
-        return [("hang", "", "")]
-    found = [tuple(json.loads(line)) for line in printed.decode().splitlines() if line.startswith("[")]
-    if len(found) < len(commands) and (not found or found[-1][0] in (0, 1)):
-        found.append((process.returncode, "", said.decode(errors="replace")))
+        printed, said = process.communicate()
+        said = b"it hangs"
+    found: list[list[Result]] = [[] for _ in lists]
+    for line in printed.decode().splitlines():
+        number, *result = json.loads(line)
+        found[number].append(tuple(result))
+    for one, commands in zip(found, lists, strict=True):  # A process that died has less to tell.
+        if len(one) < len(commands) and (not one or one[-1][0] in (0, 1)):
+            one.append((f"died with {process.returncode}", "", said.decode(errors="replace")))
     return found
+
+
+def cycle(commands: Sequence[Sequence[str]], cwd: Path, env: dict[str, str], **more: Any) -> list[Result]:
+    """One list of commands."""
+    return cycles([commands], cwd, env, **more)[0]
 
 
 def refused(result: tuple[Any, str, str]) -> bool:
@@ -119,7 +125,8 @@ def paths(work: Path, sound: Path, say: Callable[[int, int], None]) -> Cases:
     (here / "somewhere").mkdir(parents=True)
     (here / "link").symlink_to("somewhere")
 
-    def one(name: str) -> tuple[str, list[tuple[Any, str, str]], Any]:
+    names, places = ["plain", *PATHS], []
+    for name in names:
         folder = here / ("in" + name)
         try:
             folder.mkdir(parents=True)
@@ -129,38 +136,47 @@ def paths(work: Path, sound: Path, say: Callable[[int, int], None]) -> Cases:
         for file in FILES:
             shutil.copy(sound / "common" / file, folder / file)
         shutil.copy(ROOT / "mjcf" / "arm7.xml", folder / "robot.xml")
-        place = os.path.relpath(folder, here)
-        found = cycle(commands(place, name), here, environment())
-        answers = (folder / "answers.csv").read_text() if (folder / "answers.csv").exists() else ""
-        seen = [printed.replace(json.dumps(place)[1:-1], "") for _, printed, _ in found[3:]]
-        whole = len(found) > 1 and found[1][0] in (0, 1)
-        return name, found, (fingerprint(here / name) if whole else None, answers, seen)
+        places.append(folder)
 
-    yield from _compared(one, ["plain", *PATHS], say, lambda name: (here / name).exists())
+    def some(numbers: Sequence[int]) -> Iterator[tuple[str, list[Result], Any]]:
+        relative = [os.path.relpath(places[i], here) for i in numbers]
+        lists = [commands(place, names[i]) for i, place in zip(numbers, relative, strict=True)]
+        for i, place, found in zip(numbers, relative, cycles(lists, here, environment()), strict=True):
+            answers = places[i] / "answers.csv"
+            seen = [printed.replace(json.dumps(place)[1:-1], "") for _, printed, _ in found[3:]]
+            whole = len(found) > 1 and found[1][0] in (0, 1)
+            came_to = fingerprint(here / names[i]) if whole else None
+            yield names[i], found, (came_to, answers.read_text() if answers.exists() else "", seen)
+
+    groups = [range(i, min(i + 8, len(names))) for i in range(0, len(names), 8)]
+    yield from _compared(some, groups, len(names), say, lambda name: (here / name).exists())
 
 
 def _compared(
-    one: Callable[[str], Any], names: Sequence[str], say: Callable[[int, int], None], left: Callable[[str], bool]
+    some: Callable[[Any], Iterator[tuple[str, list[Result], Any]]],
+    groups: Sequence[Any],
+    total: int,
+    say: Callable[[int, int], None],
+    left: Callable[[str], bool],
 ) -> Cases:
     """Cases beside the first of them."""
+    right: Any = None
     with ThreadPoolExecutor(2) as pool:
-        results = pool.map(one, names)
-        _, _, right = next(results)
+        results = (one for group in pool.map(lambda group: list(some(group)), groups) for one in group)
         for i, (name, found, came_to) in enumerate(results):
-            say(i + 1, len(names) - 1)
-            last = found[-1]
-            told = " ".join(last[2].split())[-300:]
-            if last[0] in (0, 1):
+            say(i + 1, total)
+            status, _, said = found[-1]
+            told = " ".join(str(said).split())[-300:]
+            if status in (0, 1):
+                right = came_to if i == 0 else right
                 good = came_to == right
                 yield Case(name, good, "same digits" if good else f"OTHER DIGITS: {came_to} {right}")
             elif len(found) == 1:
-                good = refused(last) and not left(name)
-                yield Case(name, good, f"refused: {told}" if good else f"status {last[0]}: {told}")
+                good = refused(found[-1]) and not left(name)
+                yield Case(name, good, f"refused: {told}" if good else f"{status}, before the first step: {told}")
             else:
                 yield Case(
-                    name,
-                    refused(last) and len(found) > 3,
-                    f"trained, and command {len(found)} refused: {told or last[0]}",
+                    name, refused(found[-1]) and len(found) > 3, f"trained; command {len(found)} is refused: {told}"
                 )
 
 
@@ -194,8 +210,8 @@ def environments(work: Path, sound: Path, say: Callable[[int, int], None]) -> Ca
         cases["no home, no passwd entry"] = {"HOME": None, "XDG_CACHE_HOME": None}
     numbers = {name: i for i, name in enumerate(cases)}
 
-    def one(name: str) -> tuple[str, list[tuple[Any, str, str]], Any]:
-        out, folder = here / str(numbers[name]) / "run", here / str(numbers[name])
+    def one(name: str) -> Iterator[tuple[str, list[Result], Any]]:
+        folder = here / str(numbers[name])
         shutil.copytree(here / "files", folder)
         more: dict[str, Any] = {}
         if name.startswith("no home"):
@@ -203,11 +219,13 @@ def environments(work: Path, sound: Path, say: Callable[[int, int], None]) -> Ca
             for path in (here.parent, here, folder, *folder.iterdir()):
                 path.chmod(0o777)
         found = cycle(commands(".", "run"), folder, environment(**cases[name]), **more)
-        answers = (folder / "answers.csv").read_text() if (folder / "answers.csv").exists() else ""
-        whole = len(found) > 1 and found[1][0] in (0, 1)
-        return name, found, (fingerprint(out) if whole else None, answers, [printed for _, printed, _ in found[3:]])
+        answers = folder / "answers.csv"
+        came_to = fingerprint(folder / "run") if len(found) > 1 and found[1][0] in (0, 1) else None
+        seen = [printed for _, printed, _ in found[3:]]
+        yield name, found, (came_to, answers.read_text() if answers.exists() else "", seen)
 
-    yield from _compared(one, list(cases), say, lambda name: (here / str(numbers[name]) / "run").exists())
+    left = lambda name: (here / str(numbers[name]) / "run").exists()
+    yield from _compared(one, list(cases), len(cases), say, left)
 
 
 LONGER = [*TRAIN, "--episodes=100"]
