@@ -115,7 +115,8 @@ def photographs(paths: Sequence[Path]) -> Source:
 def video(path: Path) -> Source:
     """A video file. Raises `UserError` if it is none that FFmpeg reads; its frames do where it ends before its time."""
     with quiet():
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        # FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
+        capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
     if not capture.isOpened() or int(capture.get(cv2.CAP_PROP_FOURCC)) == TEXT_CODEC:
         raise UserError(f"{path} is empty, damaged, or no image or video that OpenCV reads: give an MP4 or AVI file")
     rate = _rate(capture)
