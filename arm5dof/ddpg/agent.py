@@ -29,6 +29,7 @@ Metrics = dict[str, jax.Array]
 Unit = Annotated[float, Ge(0), Le(1)]
 Positive = Annotated[float, Gt(0)]
 Count = Annotated[int, Ge(1)]
+Depth = Annotated[int, Ge(1), Le(100)]
 
 
 @settings
@@ -88,11 +89,11 @@ class DDPGConfig:
     """Whether the actor also sees the product of every pair of its observation's components."""
     actor_width: Count = static(default=128)
     """Units in a hidden layer of the actor."""
-    actor_depth: Count = static(default=3)
+    actor_depth: Depth = static(default=3)
     """The actor's hidden layers."""
     critic_width: Count = static(default=32)
     """Units in a hidden layer of the critic."""
-    critic_depth: Count = static(default=2)
+    critic_depth: Depth = static(default=2)
     """The critic's hidden layers."""
     activation: Literal["relu", "gelu", "tanh"] = static(default="gelu")
     """Of the hidden layers."""

@@ -64,8 +64,8 @@ def _detections(rows: list[dict[str, Any]]) -> Detections:
     """Their classes are numbered anew, since a file need not name them all."""
     names = tuple(dict.fromkeys(str(row["class_name"]) for row in rows))
     return Detections(
-        np.array([row["xyxy"] for row in rows], float).reshape(-1, 4),
-        np.array([row["confidence"] for row in rows], float),
+        np.array([[float(edge) for edge in row["xyxy"]] for row in rows]).reshape(len(rows), 4),
+        np.array([float(row["confidence"]) for row in rows]),
         np.array([names.index(str(row["class_name"])) for row in rows], int),
         names,
     )
