@@ -291,7 +291,7 @@ def nan(work: Path, say: Callable[[int, int], None]) -> Cases:
     """Physics that is NaN at every step in one of a hundred environments, for a whole training."""
     here = work / "nan"
     here.mkdir()
-    words = ["train", "kinematic.toml", "--num-envs=100", "--evaluate-every=400"]
+    words = ["train", "kinematic.toml", "--num-envs=100", "--evaluate-every=400", "--checkpoint-every=400"]
     quiet = {"cwd": here, "env": environment(), "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     command = [sys.executable, "-c", INJECT]
     started = [subprocess.Popen([*command, str(n), *words, f"--out={n}"], **quiet) for n in (0, 1)]
