@@ -8,8 +8,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 from arm5dof import __version__
 from arm5dof.cli import arm, compare, evaluate, export, grasp, interrupts, solve, sweep, train, vision
@@ -24,11 +26,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     when interrupted, 143 when asked to end, 141 when nobody reads what is printed."""
     warnings.showwarning = lambda message, *_, **__: print(f"arm5dof: {message}", file=sys.stderr)
     try:
+        words = sys.argv[1:] if arguments is None else arguments
+        if unreadable := next((word for word in words if not _is_text(word)), None):
+            raise UserError(f"{unreadable!r} is no UTF-8: rename what it names")
         parser = make_parser()
-        args, rest = parser.parse_known_args(arguments)
+        args, rest = parser.parse_known_args(words)
         if args.command is None:
             parser.print_help()
             return 0
+        os.environ["MPLBACKEND"] = "agg"  # Figures are written, never shown, whatever notebooks are told to use.
         from arm5dof.runtime import xla  # Asks for versions, which takes as long as all else that help needs.
 
         xla.enable_compilation_cache()
@@ -49,11 +55,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
         place = f": {error.filename}" if error.filename else ""
         kept = "; what was complete is kept" if error.errno in NO_ROOM else ""
         print(f"arm5dof: {error.strerror or error}{place}{kept}", file=sys.stderr)
+    except Exception as error:
+        if not (asked := _unimportable(error)):
+            raise
+        print(f"arm5dof: {' '.join(str(error).split())}: mend or unset {asked}", file=sys.stderr)
     except KeyboardInterrupt as stop:
         interrupts.handled()
         print(f"arm5dof: {str(stop) or 'interrupted'}", file=sys.stderr)
         return 143 if isinstance(stop, Terminated) else 130
     return 2
+
+
+def _is_text(word: str) -> bool:
+    """Whether it is UTF-8, and so can be printed and kept in files."""
+    try:
+        word.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _unimportable(error: Exception) -> str:
+    """The variables of the environment for which JAX or MuJoCo cannot be imported, if that is what happened."""
+    frames = {Path(frame.filename).parts[-3:-1] for frame in traceback.extract_tb(error.__traceback__)}
+    for module, prefix in (("jax", "JAX_"), ("mujoco", "MUJOCO_GL")):
+        if module not in sys.modules and any(module in parts for parts in frames):
+            given = {name: f"{name}={value}" for name, value in os.environ.items() if name.startswith(prefix)}
+            named = [told for name, told in given.items() if name.lower() in str(error).lower()]
+            return ", ".join(named or given.values())
+    return ""
 
 
 def make_parser() -> Parser:

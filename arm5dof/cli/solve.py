@@ -155,7 +155,10 @@ def _every(policy: Policy, inputs: Inputs, refine: int, tolerances: Mapping[str,
 
 
 def _run_folder(rest: list[str]) -> tuple[Path | None, list[str]]:
-    """The run, which is the one word that is neither an option nor a number, and the other words."""
+    """The run, which is the one word that is neither an option nor a number, or else a folder named first; and the
+    other words."""
+    if rest and not rest[0].startswith("--") and Path(rest[0]).is_dir():
+        return Path(rest[0]), rest[1:]
     words = [word for word in rest if not word.startswith("--") and not _is_number(word)]
     nothing_left(words[1:], "solve")
     return (Path(words[0]) if words else None), [word for word in rest if word not in words]

@@ -15,6 +15,7 @@ bin = "class"              # sort it by its class
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -71,7 +72,7 @@ def read_job(path: str | Path) -> list[Step]:
         values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}: give a TOML file with steps") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not valid TOML: {error}") from None
     steps = values.pop("step", None)
     if values:
@@ -140,7 +141,11 @@ def _step(values: dict[str, Any]) -> Step:
         raise UserError("a step has no pick: say which class")
     place = values.get("place")
     if place is not None:
-        if not isinstance(place, list) or len(place) != 2 or not all(isinstance(v, (int, float)) for v in place):
+        if (
+            not isinstance(place, list)
+            or len(place) != 2
+            or any(type(v) not in (int, float) or not abs(v) <= sys.float_info.max for v in place)
+        ):
             raise UserError(f"place = {place!r}: it is two numbers, [x, y], metres")
         values = {**values, "place": (float(place[0]), float(place[1]))}
     return Step(**values)

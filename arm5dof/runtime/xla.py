@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -23,8 +24,10 @@ KNOWN_JAXLIB = ((0, 8, 3), (0, 10, 2))
 
 
 def flags(current: str, jaxlib_version: str) -> str:
-    """`XLA_FLAGS` to use, given the user's own and jaxlib's version: theirs win, unknown versions are left alone."""
-    if "xla_cpu_use_fusion_emitters" in current or not _known(jaxlib_version):
+    """`XLA_FLAGS` to use, given the user's own and jaxlib's version: theirs win, unknown versions are left alone, and
+    so is the name of a file that has them."""
+    is_file = bool(current.strip()) and not current.strip().startswith("-")
+    if is_file or "xla_cpu_use_fusion_emitters" in current or not _known(jaxlib_version):
         return current
     return f"{current} {FUSION_EMITTERS}".strip()
 
@@ -106,7 +109,14 @@ def _cache() -> Path:
 
 
 def check_platform() -> None:
-    """Raise `UserError` if the user asked for devices that JAX does not find."""
+    """Raise `UserError` if the user asked for devices that JAX does not find, or for flags that XLA does not know: it
+    would end the process. It is asked in another one."""
+    if given := os.environ.get("XLA_FLAGS", "").replace(FUSION_EMITTERS, "").strip():
+        start = [sys.executable, "-c", "from jaxlib import xla_client; xla_client.make_cpu_client()"]
+        done = subprocess.run(start, capture_output=True, text=True, errors="replace", check=False)
+        if done.returncode:
+            reason = done.stderr.strip().partition("\n")[0].rpartition("] ")[2]
+            raise UserError(f"XLA_FLAGS={given} ends XLA ({reason}): mend it, or unset it")
     asked = os.environ.get("JAX_PLATFORMS")
     if not asked:
         return
@@ -129,6 +139,17 @@ def check_numbers() -> None:
         raise UserError("JAX_ENABLE_X64 is set, but environments and networks are of 32 bits: unset it")
     if here.jax_numpy_rank_promotion == "raise":
         raise UserError("JAX_NUMPY_RANK_PROMOTION=raise is set, but this package promotes ranks: unset it")
+    if here.jax_numpy_dtype_promotion == "strict":
+        raise UserError("JAX_NUMPY_DTYPE_PROMOTION=strict is set, but this package promotes types: unset it")
+    if "disallow" in str(here.jax_transfer_guard):
+        raise UserError("JAX_TRANSFER_GUARD is set, but this package lets JAX fetch what it needs: unset it")
+    if here.jax_disable_jit:
+        raise UserError("JAX_DISABLE_JIT is set, and without compilation a training takes days: unset it")
+    if here.jax_default_prng_impl != "threefry2x32" or not here.jax_threefry_partitionable:
+        raise UserError(
+            "JAX_DEFAULT_PRNG_IMPL or JAX_THREEFRY_PARTITIONABLE is set, but seeds stand for the numbers of JAX's own "
+            "default: unset both"
+        )
 
 
 def programs_folder() -> Path | None:

@@ -23,6 +23,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import sys
 import tomllib
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -257,6 +258,8 @@ def _axis(name: str, full: str, said: Any, sample_seed: int | None, search: Sear
     count = said.get("count")
     if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 0):
         raise UserError(f"axis {name!r}: count = {count!r} should be a whole number")
+    if count is not None and count > MOST:
+        raise UserError(f"axis {name!r}: count = {count} is more than {MOST}")
     if not kinds:
         if full != SEED:
             raise UserError(f"axis {name!r}: a count alone is for seeds; say log_uniform, uniform or range")
@@ -285,15 +288,15 @@ def _steps(name: str, said: Any) -> Iterator[float | int]:
     start, stop, step = _numbers(name, "range", said, 3)
     if step == 0:
         raise UserError(f"axis {name!r}: range = {said!r} has a step of 0")
-    count = math.floor((stop - start) / step + 1e-9) + 1
-    if count > MOST:
-        raise UserError(f"axis {name!r}: range = {said!r} has {count} values")
-    return (start + i * step for i in range(max(count, 0)))
+    last = (stop - start) / step
+    if not last < MOST:
+        raise UserError(f"axis {name!r}: range = {said!r} has more than {MOST} values")
+    return (start + i * step for i in range(max(math.floor(max(last, -1.0) + 1e-9) + 1, 0)))
 
 
 def _numbers(name: str, kind: str, said: Any, count: int) -> list[Any]:
     good = isinstance(said, (list, tuple)) and len(said) == count
-    if not good or any(isinstance(v, bool) or not isinstance(v, (int, float)) or not math.isfinite(v) for v in said):
+    if not good or any(type(v) not in (int, float) or not abs(v) <= sys.float_info.max for v in said):
         raise UserError(f"axis {name!r}: {kind} = {said!r} should be {count} numbers")
     return list(said)
 

@@ -5,6 +5,7 @@ Everywhere else an image is RGB, uint8, (h, w, 3).
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
-from arm5dof.vision.opencv import quiet
+from arm5dof.vision.opencv import overheard
 
 ORIENTATION_TAG = 0x0112
 """Of EXIF."""
@@ -38,19 +39,41 @@ def read(path: str | Path, upright: bool = True) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"no image {path}: give the path of an image file")
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
-    try:
-        with quiet():
-            pixels = cv2.imdecode(content, flags) if content.size else None
-    except cv2.error:
-        pixels = None
+    orientation = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | orientation)
     if pixels is None:
         raise UserError(f"{path} is empty, damaged, or no image that OpenCV reads: give a JPEG or PNG file")
     try:
         return rgb(pixels[..., ::-1])
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
+
+
+def decode(path: Path, flags: int) -> np.ndarray | None:
+    """Read an image file as OpenCV has it.
+
+    Args:
+        path: The file.
+        flags: OpenCV's `IMREAD_...`.
+
+    Returns:
+        Its pixels, or None if it is no image, or too damaged for one.
+
+    Warns:
+        UserWarning: The library that reads JPEG found damage, and filled in what was missing.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    try:
+        with overheard() as said:
+            pixels = cv2.imdecode(content, flags) if content.size else None
+    except cv2.error:
+        return None
+    if pixels is not None and (damage := [line for line in said if "Corrupt JPEG" in line]):
+        warnings.warn(f"{path} may be damaged, look at it: {damage[0]}", stacklevel=3)
+    return pixels
 
 
 def has_orientation(path: str | Path) -> bool:

@@ -20,6 +20,7 @@ from helpers.serial import serial_arm
 
 from arm5dof.arm import load_arm
 from arm5dof.cli import main as cli
+from arm5dof.cli import solve
 from arm5dof.errors import UserError
 from arm5dof.training import checkpoint
 from arm5dof.training.checkpoint import Checkpoints
@@ -485,6 +486,18 @@ def test_failures_that_nobody_waits_for_are_silent(caplog, capfd):
         asyncio.run(give_up())
         raise OSError("File too large")
     assert not caplog.records and not capfd.readouterr().err
+
+
+def test_a_run_may_be_called_like_a_number(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("1e5", "nan", "12"):
+        Path(name).mkdir()
+        assert solve._run_folder([name, "--target", "0.1", "0", "12"]) == (Path(name), ["--target", "0.1", "0", "12"])
+    assert solve._run_folder(["--target", "0.1", "0", "12", "runs/a"])[0] == Path("runs/a")
+
+
+def test_a_name_that_is_no_text_is_one_line(fails):
+    assert "'not-\\udcff' is no UTF-8: rename what it names" in fails("arm", os.fsdecode(b"not-\xff"))
 
 
 def test_help_lists_every_setting(capsys):

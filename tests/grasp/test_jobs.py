@@ -36,7 +36,10 @@ RED, BLUE, CAN = (CLASS_NAMES.index(name) for name in ("red cube", "blue cube", 
         ('[[step]]\npick = "can"\nbin = "can"\non = "ring"', "one of place, bin and on"),
         ('[[step]]\npick = "any"\nplace = [0.1, 0.1]', 'picks "any"'),
         ('[[step]]\npick = "can"\nplace = [0.1]', "two numbers"),
-        ('[[step]]\npick = "can"\nplace = [0.1, nan]', "no place"),
+        ('[[step]]\npick = "can"\nplace = [0.1, nan]', "two numbers"),
+        (f'[[step]]\npick = "can"\nplace = [0.1, 1{"0" * 400}]', "two numbers"),
+        (f"x = 1{'0' * 5000}", "not valid TOML"),
+        ("x = " + "[" * 10_000, "not valid TOML"),
     ],
 )
 def test_what_is_no_job_is_told(tmp_path: Path, text: str, words: str):

@@ -100,7 +100,34 @@ def test_what_jax_is_set_to_is_refused_where_it_does_not_work():
         assert "JAX_ENABLE_X64" in said(xla.check_numbers)
     with jax.numpy_rank_promotion("raise"):
         assert "JAX_NUMPY_RANK_PROMOTION" in said(lambda: make_env(load_config("kinematic.toml")))
-    code = "from arm5dof.runtime import xla; xla.check_platform()"
-    environment = {**os.environ, "JAX_PLATFORMS": "rocm"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert "UserError: JAX_PLATFORMS=rocm: JAX finds no such device here" in done.stderr
+    with jax.numpy_dtype_promotion("strict"):
+        assert "JAX_NUMPY_DTYPE_PROMOTION" in said(xla.check_numbers)
+    with jax.disable_jit():
+        assert "JAX_DISABLE_JIT" in said(xla.check_numbers)
+    with jax.default_prng_impl("rbg"):
+        assert "JAX_DEFAULT_PRNG_IMPL" in said(xla.check_numbers)
+    with jax.threefry_partitionable(False):
+        assert "JAX_THREEFRY_PARTITIONABLE" in said(xla.check_numbers)
+    with jax.transfer_guard("disallow"):
+        assert "JAX_TRANSFER_GUARD" in said(xla.check_numbers)
+
+
+@pytest.mark.parametrize(
+    "name, value, expected",
+    [
+        ("JAX_PLATFORMS", "rocm", "JAX_PLATFORMS=rocm: JAX finds no such device here"),
+        ("XLA_FLAGS", "--xla_no_such_flag", "XLA_FLAGS=--xla_no_such_flag ends XLA (Unknown flag in XLA_FLAGS"),
+        ("XLA_FLAGS", "no-such-file", "XLA_FLAGS=no-such-file ends XLA (Could not open file"),
+        ("JAX_ENABLE_X64", "maybe", "mend or unset JAX_ENABLE_X64=maybe"),
+        ("MUJOCO_GL", "nonsense", "mend or unset MUJOCO_GL=nonsense"),
+    ],
+)
+def test_what_the_environment_asks_for_in_vain_is_one_line(name, value, expected):
+    start = [sys.executable, "-m", "arm5dof", "arm", "arm7.xml"]
+    done = subprocess.run(start, env={**os.environ, name: value}, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("arm5dof: ") and done.stderr.count("\n") == 1
+    assert expected in done.stderr
+
+
+def test_a_file_of_flags_is_left_alone():
+    assert xla.flags("flags.txt", "0.8.3") == "flags.txt"

@@ -44,6 +44,21 @@ def test_photographs_are_turned_upright(tmp_path):
     assert not images.has_orientation(tmp_path / "words.jpg")
 
 
+def test_damage_is_told_in_a_line_of_our_own(tmp_path, capfd):
+    pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    for suffix in (".jpg", ".png"):
+        content = bytearray(cv2.imencode(suffix, pixels)[1].tobytes())
+        (tmp_path / f"short{suffix}").write_bytes(content[: len(content) // 2])
+        content[len(content) // 2 : len(content) // 2 + 8] = bytes(8)
+        (tmp_path / f"flipped{suffix}").write_bytes(content)
+    with pytest.warns(UserWarning, match=r"flipped.jpg may be damaged, look at it: Corrupt JPEG data"):
+        assert images.read(tmp_path / "flipped.jpg").shape == pixels.shape
+    for name in ("short.jpg", "short.png", "flipped.png"):
+        with pytest.raises(UserError, match=f"{name} is empty, damaged, or no image"):
+            images.read(tmp_path / name)
+    assert capfd.readouterr().err == ""  # Where libjpeg and libpng would say it in their own words.
+
+
 def test_ranges_meet_at_both_ends_and_round():
     np.testing.assert_array_equal(images.rgb(np.array([[0, 128, 129, 65535]], np.uint16))[..., 0], [[0, 0, 1, 255]])
     np.testing.assert_array_equal(images.rgb(np.array([[0, 0.5, 1.0]]))[..., 0], [[0, 128, 255]])

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from arm5dof.errors import UserError
+from arm5dof.vision import images
 from arm5dof.vision.calibration.boards import Board, Corners
 from arm5dof.vision.calibration.poses import pose_matrix
 from arm5dof.vision.camera import Camera
@@ -175,12 +176,7 @@ def image_names(paths: Sequence[Path]) -> list[str]:
 def read_gray(path: Path) -> np.ndarray:
     """A photograph in gray as the sensor saw it, whatever its EXIF orientation tag says, (h, w), uint8. Raises
     `UserError` if it is none."""
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        gray = cv2.imdecode(content, flags) if content.size else None
-    except cv2.error:  # Larger than OpenCV's limit, for instance.
-        gray = None
+    gray = images.decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if gray is None:
-        raise UserError(f"{path} is {'no image that can be read' if content.size else 'empty'}: leave it out")
+        raise UserError(f"{path} is {'no image that can be read' if path.stat().st_size else 'empty'}: leave it out")
     return gray

@@ -51,7 +51,7 @@ def read(path: Path) -> list[DetectedFrame]:
         if content and all("detections" in entry for entry in content):
             return [_frame(entry) for entry in content]
         return [DetectedFrame(None, None, _detections(content))]
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         raise UserError(f"{path} holds no detections: give the JSON that arm5dof vision detect writes") from None
 
 
@@ -64,8 +64,8 @@ def _detections(rows: list[dict[str, Any]]) -> Detections:
     """Their classes are numbered anew, since a file need not name them all."""
     names = tuple(dict.fromkeys(str(row["class_name"]) for row in rows))
     return Detections(
-        np.array([row["xyxy"] for row in rows], float).reshape(-1, 4),
-        np.array([row["confidence"] for row in rows], float),
+        np.array([[float(edge) for edge in row["xyxy"]] for row in rows]).reshape(len(rows), 4),
+        np.array([float(row["confidence"]) for row in rows]),
         np.array([names.index(str(row["class_name"])) for row in rows], int),
         names,
     )

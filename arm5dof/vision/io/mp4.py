@@ -29,7 +29,7 @@ class Mp4:
         self.frames = 0
         with quiet():
             code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._encoder = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, rate, size)
+            self._encoder = cv2.VideoWriter(str(path.absolute()), cv2.CAP_FFMPEG, code, rate, size)
         if not self._encoder.isOpened():
             width, height = size
             raise UserError(f"OpenCV cannot write a video of {width} x {height} at {rate:g} frames per second")

@@ -117,7 +117,8 @@ def photographs(paths: Sequence[Path], upright: bool = True) -> Source:
 def video(path: Path) -> Source:
     """A video file. Raises `UserError` if it is none that FFmpeg reads; its frames do where it ends before its time."""
     with quiet():
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        # FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
+        capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
     if not capture.isOpened() or int(capture.get(cv2.CAP_PROP_FOURCC)) == TEXT_CODEC:
         raise UserError(f"{path} is empty, damaged, or no image or video that OpenCV reads: give an MP4 or AVI file")
     rate = _rate(capture)
@@ -186,8 +187,7 @@ def read_depth(path: Path) -> np.ndarray:
         UserError: It is no such image.
         OSError: It cannot be read.
     """
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    pixels = images.decode(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise UserError(f"{path} is no depth image: give a PNG file with one channel of 16 bits, in millimetres")
     return pixels / 1000

@@ -179,6 +179,10 @@ def test_bad_input_is_one_line(folder, tmp_path, capfd):
         "box": '[{"class_name": "cube", "confidence": 1, "xyxy": [1, 2, 3]}]',
         "nan": '[{"class_name": "cube", "confidence": NaN, "xyxy": [1, 2, 3, 4]}]',
         "frame": '[{"name": "a", "image_size": [3], "detections": []}]',
+        "huge": f'[{{"class_name": "cube", "confidence": 1, "xyxy": [1, 2, 3, 1{"0" * 400}]}}]',
+        "nested": '[{"class_name": "cube", "confidence": [1], "xyxy": [1, 2, 3, 4]}]',
+        "edges": '[{"class_name": "cube", "confidence": 1, "xyxy": [[1, 2], [3, 4]]}]',
+        "deep": "[" * 100_000,
     }.items():
         (tmp_path / f"{name}.json").write_text(text)
         assert command(tmp_path / f"{name}.json", "--camera", folder / "posed.yml", *HEIGHTS) == 2

@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from helpers.videos import greys, write_video
 
 from arm5dof.errors import UserError
-from arm5dof.vision.io.sources import read_depth
+from arm5dof.vision.io.sources import open_source, read_depth
 
 
 def test_depth_images_are_millimetres_in_sixteen_bits(tmp_path):
@@ -17,3 +18,10 @@ def test_depth_images_are_millimetres_in_sixteen_bits(tmp_path):
         path.write_bytes(content)
         with pytest.raises(UserError, match="is no depth image: give a PNG file with one channel of 16 bits"):
             read_depth(path)
+
+
+def test_a_colon_in_a_name_is_no_protocol(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a:b").mkdir()
+    write_video(tmp_path / "a:b" / "clip.mp4", greys(3))
+    assert len(list(open_source(["a:b/clip.mp4"]).frames)) == 3
