@@ -17,10 +17,11 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.vision.camera import Array, Camera
+from arm5dof.vision.lens import split
 from arm5dof.vision.objects import CATALOGUE
 
-AXES, SIGNS = np.array([0, 1, 0, 1]), np.array([-1, -1, 1, 1])
-"""Of the edges of a box: along which axis of the image, and whether they are the smallest or the largest there."""
+ACROSS, SIGNS = np.array([True, False, True, False]), np.array([-1, -1, 1, 1], np.float32)
+"""Of the edges of a box: whether x or y tells them, and whether they are the smallest or the largest there."""
 
 FORMS = {
     "block": np.array([[-1, 1, 0], [1, 1, 0]]),
@@ -100,10 +101,12 @@ def solid_box(
         return jnp.asarray(camera.position) + points @ jnp.asarray(camera.rotation).T
 
     # As a pinhole would show it first. Where a coordinate is extreme, just where matters to the second order only.
-    upright = edges(jnp.broadcast_to(np.eye(2)[AXES][:, None], (4, 2, 2)))
-    ascent = camera.magnification(jax.lax.stop_gradient(upright))[jnp.arange(4), :, AXES]
+    upright = edges(jnp.broadcast_to(np.stack([ACROSS, ~ACROSS], -1)[:, None].astype(np.float32), (4, 2, 2)))
+    by_point = camera.magnification(jax.lax.stop_gradient(upright))
+    ascent = jnp.where(ACROSS[:, None, None], by_point[..., 0, :], by_point[..., 1, :])
     points = edges(jax.lax.stop_gradient(ascent))
-    pixels = camera.project(points)[jnp.arange(4), :, AXES] + 0.5
+    x, y = split(camera.project(points) + 0.5)
+    pixels = jnp.where(ACROSS[:, None], x, y)
     return jnp.where(SIGNS < 0, pixels.min(1), pixels.max(1))
 
 
