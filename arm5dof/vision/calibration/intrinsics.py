@@ -131,6 +131,7 @@ def calibrate(views: BoardViews, coefficients: int | None = None, lens: str = "p
     if coefficients not in LENSES[lens].counts:
         raise UserError(f"{coefficients} distortion coefficients: give {LENSES[lens].wanted}")
     kept, copies = distinct(views.found)
+    _check_different(kept, views)
     first = fit(kept, views.size, coefficients, lens=lens)
     _check_lens(kept, first)
     kept, outliers, result = _of_one_camera(kept, first)

@@ -91,7 +91,7 @@ def test_nobody_could_do_better():
     """With Gaussian noise of 0.2 degrees and 1 mm along each axis the errors are those of the Cramer-Rao bound, from a
     Jacobian by finite differences; and the deviations that are reported say how large they are."""
     found, bound, scores = [], [], []
-    for seed in range(80):
+    for seed in range(200):
         rng = np.random.default_rng(seed)
         camera, board, hands, seen = scene(rng)
         noise = rng.normal(size=(2, 15, 3))
@@ -112,7 +112,7 @@ def test_nobody_could_do_better():
         shift = camera[:3, :3].T @ (result.x[:3, 3] - camera[:3, 3])
         scores.append(np.r_[turn, shift] / np.sqrt(np.diag(result.covariance))[:6])
     best = np.median(np.array(bound), axis=(0, 2))
-    np.testing.assert_allclose(np.median(found, axis=0), best, rtol=0.15)
+    np.testing.assert_allclose(np.median(found, axis=0), best, rtol=0.12)
     np.testing.assert_allclose(np.sqrt(np.square(scores).mean(0)), 1, atol=0.2)
 
 

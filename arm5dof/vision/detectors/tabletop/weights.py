@@ -3,6 +3,7 @@ folded in, and the names of the classes. Nothing in it is ever unpickled."""
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -26,6 +27,7 @@ DAMAGED = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
     zlib.error,
+    tokenize.TokenError,
     ValueError,
     KeyError,
     TypeError,

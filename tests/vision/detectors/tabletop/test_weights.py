@@ -54,6 +54,11 @@ def damaged(kind, path, tmp_path):
             np.savez(content, weights=np.zeros(3))
         case "array":
             np.save(content, np.zeros(3))
+        case "header":
+            array = io.BytesIO()
+            np.save(array, np.zeros(3))
+            with zipfile.ZipFile(content, "w") as archive:
+                archive.writestr("class_names.npy", array.getvalue().replace(b"}", b"("))
         case "missing":
             arrays.pop("refiner/logits/bias")
             np.savez(content, **arrays)
@@ -79,7 +84,7 @@ class Bomb:
 DAMAGES = ["cut", "empty", "text", "flipped", "foreign", "array", "missing", "shape", "classes", "pickle"]
 
 
-@pytest.mark.parametrize("kind", [*DAMAGES, "not finite", "text for numbers"])
+@pytest.mark.parametrize("kind", [*DAMAGES, "header", "not finite", "text for numbers"])
 def test_damaged_and_foreign_weights_are_refused(good, tmp_path, kind):
     with pytest.raises(UserError, match="train the tabletop detector") as error:
         TabletopDetector(damaged(kind, good, tmp_path))
