@@ -8,7 +8,8 @@ import pytest
 
 KILL = "import os, signal, time\ndef kill():\n    os.kill(os.getpid(), signal.SIGINT)\n"
 START = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # Jobs in a shell's background start without it.
 from hit import kill
 from arm5dof.__main__ import main
 from arm5dof.cli import compare
