@@ -136,7 +136,7 @@ def test_runs_and_sweeps_stand_side_by_side(done, tmp_path):
 
 def test_whatever_is_killed_the_table_is_the_same(done, asked, tmp_path):
     """A worker, and then the driver, at random moments."""
-    out, moments = tmp_path / "killed", random.Random()
+    out, moments, before = tmp_path / "killed", random.Random(), set(psutil.Process().children())
     code = f"from arm5dof import sweep; sweep({asked!r}, {str(out)!r}, workers=2)"
     driver = subprocess.Popen([sys.executable, "-c", code], env=environment())
     while driver.poll() is None and not list(out.glob("members/m0*")):
@@ -150,7 +150,7 @@ def test_whatever_is_killed_the_table_is_the_same(done, asked, tmp_path):
     assert driver.wait() == -signal.SIGKILL and len(list(out.glob("members/*.json"))) < 6
     again = sweep(asked, out, workers=2, resume=True)
     assert same(again.table) == same(done.table)
-    assert not psutil.Process().children()
+    assert set(psutil.Process().children()) <= before, "no worker is left"
 
 
 def test_a_member_that_fails_costs_nobody_else_anything(experiment, tmp_path, monkeypatch):

