@@ -283,13 +283,19 @@ def _read_moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tupl
 
 def _warn_of_viewpoint(cameras: Sequence[Camera], table_height: float) -> None:
     """Say where the shipped detector, and whatever else was trained as it was, is out of its depth."""
-    from arm5dof.vision.detectors.tabletop.viewpoint import unlike_training
+    from arm5dof.vision.detectors.tabletop.viewpoint import (
+        MAX_DISTANCE,
+        MIN_DISTANCE,
+        MIN_ELEVATION,
+        unlike_training,
+    )
 
     for camera in cameras:
         if camera.has_extrinsics and (unusual := unlike_training(camera, table_height)):
             print(
-                "arm5dof: the shipped detector is for cameras 0.5 to 1 m from the table, at least 30 degrees above it, "
-                f"not rolled, and this one is {unusual}: do not trust what is found",
+                f"arm5dof: the shipped detector is for cameras {MIN_DISTANCE:g} to {MAX_DISTANCE:g} m from the table, "
+                f"at least {math.degrees(MIN_ELEVATION):.0f} degrees above it, not rolled, and this one is {unusual}: "
+                "do not trust what is found",
                 file=sys.stderr,
             )
 

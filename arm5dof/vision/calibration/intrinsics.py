@@ -76,8 +76,8 @@ class Calibration:
     rms: float
     """Root mean square of the reprojection error, pixels."""
     deviations: np.ndarray
-    """Standard deviations of the `intrinsics`, (4 + coefficients,): by how far the views disagree or, after `fit`,
-    those of a fit in which the errors of all corners are independent."""
+    """Standard deviations of the `intrinsics`, (4 + coefficients,): by how far the views disagree or, after `fit`
+    of a pinhole, OpenCV's, for which the errors of all corners are independent."""
     errors: dict[str, float]
     """Root mean square reprojection error of every view used, pixels."""
     outliers: dict[str, float]
