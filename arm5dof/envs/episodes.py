@@ -15,6 +15,9 @@ from arm5dof.envs.inverse_kinematics import choose
 if TYPE_CHECKING:
     from arm5dof.envs.arm_goal import ArmGoalEnv
 
+AT_REST = 1e-6
+"""Radians (metres) a control step: arms that move less, all of them, count as at rest. Float32 is as exact."""
+
 Errors = dict[str, jax.Array]
 """By component, (n,) each, metres or radians; infinite where physics blew up."""
 
@@ -29,7 +32,7 @@ class Correction(NamedTuple):
 
 
 def corrected(env: ArmGoalEnv, act: Act, state: State, goals: Goal, corrections: int) -> Errors:
-    """Errors at the end of episodes of an environment's own steps.
+    """Errors at the end of episodes of an environment's own steps; once all arms are at rest nothing more is simulated.
 
     Args:
         env: The environment.
@@ -41,21 +44,31 @@ def corrected(env: ArmGoalEnv, act: Act, state: State, goals: Goal, corrections:
     """
     branch = act.branch(state.obs)
 
-    def step(now: Correction, correcting: jax.Array) -> tuple[Correction, None]:
+    def step(carry: tuple[jax.Array, jax.Array, Correction]) -> tuple[jax.Array, jax.Array, Correction]:
+        done, _, now = carry
+        correcting = done <= corrections
         asked = choose(jnp.broadcast_to(correcting, now.reward.shape), now.asked, now.best)
         obs = jax.vmap(env.replace_goal)(now.state.obs, asked)
         state = jax.vmap(env.step)(now.state, act(obs, branch))
+        moved = jnp.abs(state.data.qpos - now.state.data.qpos).max()
         better = correcting & (state.reward > now.reward)
-        return Correction(
-            state=state,
-            asked=jax.vmap(env.correct)(asked, jax.vmap(env.achieved)(state.obs), goals),
-            best=choose(better, asked, now.best),
-            reward=jnp.where(better, state.reward, now.reward),
-        ), None
+        return (
+            done + 1,
+            moved > AT_REST,
+            Correction(
+                state=state,
+                asked=jax.vmap(env.correct)(asked, jax.vmap(env.achieved)(state.obs), goals),
+                best=choose(better, asked, now.best),
+                reward=jnp.where(better, state.reward, now.reward),
+            ),
+        )
 
-    correcting = jnp.arange(env.episode_length) <= corrections
+    def goes_on(carry: tuple[jax.Array, jax.Array, Correction]) -> jax.Array:
+        done, moving, _ = carry
+        return (done < env.episode_length) & (moving | (done <= corrections + 1))
+
     start = Correction(state, goals, goals, jnp.full(len(state.reward), -jnp.inf))
-    final, _ = jax.lax.scan(step, start, correcting)
+    _, _, final = jax.lax.while_loop(goes_on, step, (jnp.array(0), jnp.array(True), start))
     return _finite(final.state)
 
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import timedelta
 from typing import Any
 
 from rich.console import Console
@@ -19,7 +20,6 @@ from rich.progress import (
     Task,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.text import Text
 
@@ -57,7 +57,7 @@ class Bar:
             # Rich would send what is printed meanwhile to stderr: right on one terminal, wrong into a file or pipe.
             redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),
         )
-        self._task = self._progress.add_task(what, total=total, completed=done, note="")
+        self._task = self._progress.add_task(what, total=total, completed=done, note="", later=0.0)
         self._before: Any = None
         self._asked_to_end = False
 
@@ -76,19 +76,20 @@ class Bar:
     def _terminate(self, *_: object) -> None:
         self._asked_to_end = True
 
-    def update(self, done: int, note: str = "") -> None:
-        """Move to `done` and show a note."""
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None:
+        """Move to `done` and show a note. What else there is to do takes so many seconds, which the ETA counts."""
         if self._asked_to_end:
             raise Terminated
         self.done = done
-        self._progress.update(self._task, completed=done, note=note)
+        self._progress.update(self._task, completed=done, note=note, later=later)
         now = time.monotonic()
         if not self._console.is_terminal and now - self._printed > LINE_EVERY_S:
             self._printed = now
             rate = max(done - self._first, 1) / (now - self._started)
             of, eta = "", ""
             if self.total is not None:
-                of, eta = f"/{self.total}", f"  ETA {(self.total - done) / rate:.0f} s" if done < self.total else ""
+                left = (self.total - done) / rate + later
+                of, eta = f"/{self.total}", f"  ETA {left:.0f} s" if left > 0 else ""
             self.say(f"{self.what}: {done}{of} {self.unit}  {_per_second(rate)}  {note}{eta}")
 
     def say(self, line: str) -> None:
@@ -112,11 +113,16 @@ def late_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], 
         yield update
 
 
-class _Remaining(TimeRemainingColumn):
-    """When it will be done; nothing once all is but what the note tells."""
+class _Remaining(ProgressColumn):
+    """When it will be done; nothing once it is, or while nobody knows."""
+
+    max_refresh = 0.5
 
     def render(self, task: Task) -> Text:
-        return Text("") if task.finished else Text.assemble("ETA ", super().render(task))
+        left = 0.0 if task.finished else task.time_remaining
+        if left is None or not (left := left + task.fields["later"]):
+            return Text("")
+        return Text(f"ETA {timedelta(seconds=round(left))}", style="progress.remaining")
 
 
 class _Rate(ProgressColumn):

@@ -156,7 +156,7 @@ class _Stopping(Silent):
     def __init__(self, opened: Run, stop: Callable[[Run], bool]) -> None:
         self._run, self._stop, self._seen = opened, stop, 0
 
-    def update(self, done: int, note: str = "") -> None:
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None:
         path = self._run.folder / curves.EVALUATIONS
         seen = path.stat().st_mtime_ns if path.exists() else 0
         if seen != self._seen:

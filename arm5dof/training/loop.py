@@ -23,8 +23,8 @@ from arm5dof.training.trainer import Trainer
 class Reporter(Protocol):
     """Who is told how a training goes. `arm5dof.runtime.progress.Bar` is one."""
 
-    def update(self, done: int, note: str = "") -> None:
-        """So many episodes are done."""
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None:
+        """So many episodes are done; the evaluations to come take so many seconds, as far as is known."""
         ...
 
     def say(self, line: str) -> None:
@@ -35,7 +35,7 @@ class Reporter(Protocol):
 class Silent:
     """A reporter that tells nobody."""
 
-    def update(self, done: int, note: str = "") -> None: ...
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None: ...
 
     def say(self, line: str) -> None: ...
 
@@ -147,6 +147,7 @@ def _train(
             _ = made.env.failure(found), found[made.env.headline]
     if at.steps and (not rows or rows[-1]["steps"] < at.steps):
         reporter.say(f"{run.folder / curves.METRICS} lacks what was trained before episode {at.episodes}")
+    measure = Evaluations(run, made, reporter)
     before = rows[-1]["seconds"] if rows else 0.0
     started = time.monotonic()
 
@@ -156,7 +157,7 @@ def _train(
                 at = made.counters
                 due = made.due(at, budget.evaluate_every)
                 if (due or made.finished) and all(e["steps"] != at.steps for e in evaluations):
-                    evaluations.append(_evaluate(run, made, reporter))
+                    evaluations.append(measure())
                     check_folder()
                     curves.write_evaluations(run.folder, evaluations)
                     log.evaluation(evaluations[-1])
@@ -168,7 +169,7 @@ def _train(
                 rows.append(trainer.row(at, before + seconds, metrics))
                 write(rows[-1])
                 log.epoch(rows[-1])
-                reporter.update(at.episodes, _note(made.env, rows, metrics))
+                reporter.update(at.episodes, _note(made.env, rows, metrics), measure.seconds_to_come)
                 if made.due(at, budget.checkpoint_every) or made.finished:
                     checkpoints.save(made.state)
         except KeyboardInterrupt:
@@ -187,27 +188,45 @@ def _save_at_once(made: Trainer, checkpoints: Checkpoints) -> None:
         checkpoints.save(made.state)
 
 
-def _evaluate(run: Run, made: Trainer, reporter: Reporter) -> dict[str, Any]:
-    protocol, at, env = run.config.evaluate, made.counters, made.env
-    targets = protocol.targets if made.finished else protocol.interim_targets
-    first: tuple[float, int] | None = None
+class Evaluations:
+    """The evaluations of a run, one after the other, and how long those take that are still to come."""
 
-    def show(done: int) -> None:
-        nonlocal first
-        left = ""
-        if first is None and done:  # What comes before also compiles.
-            first = time.monotonic(), done
-        elif first is not None and done < targets:
-            left = f", {(time.monotonic() - first[0]) / (done - first[1]) * (targets - done):.0f} s left"
-        reporter.update(at.episodes, f"evaluating {done}/{targets} targets{left}")
+    def __init__(self, run: Run, made: Trainer, reporter: Reporter) -> None:
+        self.run, self.made, self.reporter = run, made, reporter
+        self.pace = 0.0
+        """Seconds a target took of late; 0 before the first evaluation."""
 
-    show(0)
-    results = evaluate.evaluate(made.policy(), targets, run.config.train.seed, show)
-    reporter.say(
-        f"episode {at.episodes}: {env.metrics[env.headline].text(results[env.headline])} "
-        f"({env.headline}, {targets} unseen targets)"
-    )
-    return {**at._asdict(), "targets": targets, **results}
+    def __call__(self) -> dict[str, Any]:
+        """Measure the policy as it is now: what was found, with the counters."""
+        at, env = self.made.counters, self.made.env
+        protocol = self.run.config.evaluate
+        targets = protocol.targets if self.made.finished else protocol.interim_targets
+        started, first = time.monotonic(), 0
+
+        def show(done: int) -> None:
+            nonlocal started, first
+            if done > first:
+                self.pace = (time.monotonic() - started) / (done - first)
+            if not first:  # What comes before also compiles.
+                started, first = time.monotonic(), done
+            later = self.pace * (targets - done) + self.seconds_to_come
+            self.reporter.update(at.episodes, f"evaluating {done}/{targets} targets", later)
+
+        show(0)
+        results = evaluate.evaluate(self.made.policy(), targets, self.run.config.train.seed, show)
+        self.reporter.say(
+            f"episode {at.episodes}: {env.metrics[env.headline].text(results[env.headline])} "
+            f"({env.headline}, {targets} unseen targets)"
+        )
+        return {**at._asdict(), "targets": targets, **results}
+
+    @property
+    def seconds_to_come(self) -> float:
+        """After the one that is due now."""
+        if self.made.finished:
+            return 0.0
+        protocol = self.run.config.evaluate
+        return self.pace * (protocol.targets + self.made.evaluations_between * protocol.interim_targets)
 
 
 def _note(env: Task, rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:

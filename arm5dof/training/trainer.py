@@ -225,7 +225,17 @@ class Trainer:
 
     def due(self, at: Counters, every: int) -> bool:
         """Whether so many episodes have gone by since the start, or since the last time."""
-        return at.steps > 0 and at.steps % (every // self.config.train.num_envs * self.env.episode_length) == 0
+        return at.steps > 0 and at.steps % self._steps(every) == 0
+
+    @property
+    def evaluations_between(self) -> int:
+        """How many evaluations are due after now and before the end."""
+        every = self._steps(self.config.train.evaluate_every)
+        return (self.total_steps - 1) // every - self.counters.steps // every
+
+    def _steps(self, episodes: int) -> int:
+        """Steps of every environment in so many episodes."""
+        return episodes // self.config.train.num_envs * self.env.episode_length
 
     @property
     def finished(self) -> bool:

@@ -36,7 +36,7 @@ class Told(Silent):
     def say(self, line):
         self.lines.append(line)
 
-    def update(self, done, note=""):
+    def update(self, done, note="", later=0.0):
         self.notes.append((done, note))
 
 

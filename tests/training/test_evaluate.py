@@ -11,10 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from arm5dof.arm import Arm
 from arm5dof.ddpg import DDPG
+from arm5dof.envs.episodes import corrected
 from arm5dof.envs.inverse_kinematics import candidates
 from arm5dof.envs.metrics import Error
-from arm5dof.envs.reach import Reach
+from arm5dof.envs.reach import Reach, ReachConfig
 from arm5dof.training import evaluate
 from arm5dof.training.config import load_config
 from arm5dof.training.policy import Policy
@@ -77,6 +79,26 @@ class ByCritic:
 
     def answers(self, obs: dict) -> jax.Array:
         return self(obs, self.favourite)[:, None]
+
+
+def test_an_episode_ends_where_c_mujoco_brings_the_arm(arm: Arm):
+    """A very long one, of which no more is simulated than until the arms are at rest."""
+    n, env = 20, Reach(ReachConfig(episode_length=10**7), arm)
+    agent = DDPG(env, CONFIG, num_envs=2, episode_length=160, total_steps=1)
+    policy = Policy(env, agent, CONFIG, jax.jit(agent.init)(CONFIG, jax.random.key(0)).networks)
+    goals = jax.vmap(env.sample_goal)(jax.random.split(jax.random.key(1), n))
+    starts = arm.sample(jax.random.key(2), (n,))
+    state = jax.vmap(env.start)(starts, goals)
+    errors = jax.jit(lambda: corrected(env, policy, state, goals, 0))()["distance"]
+    asked = jax.vmap(env.joints)(policy(state.obs))
+    model = arm.free_model
+    data = mujoco.MjData(model)
+    for start, told, goal, error in zip(*map(np.asarray, (starts, asked, goals, errors)), strict=True):
+        mujoco.mj_resetData(model, data)
+        data.qpos[arm.qpos], data.ctrl[arm.actuators] = start, arm.to_ctrl(told)
+        mujoco.mj_step(model, data, nstep=160 * env.config.substeps)
+        mujoco.mj_kinematics(model, data)
+        assert error == pytest.approx(np.linalg.norm(data.site_xpos[arm.site] - goal), abs=1e-5)
 
 
 @pytest.mark.parametrize("refinements", [0, 3])

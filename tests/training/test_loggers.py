@@ -51,7 +51,7 @@ class Memory:
 class Interrupted(Silent):
     """A reporter that interrupts the training in its third epoch: after the checkpoint, which is then behind."""
 
-    def update(self, done: int, note: str = "") -> None:
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None:
         if done > 2:
             raise KeyboardInterrupt
 

@@ -58,9 +58,10 @@ class Told(Silent):
     """A reporter that remembers, and kills the training once so many episodes are done."""
 
     def __init__(self, until: float = np.inf) -> None:
-        self.until, self.lines = until, list[str]()
+        self.until, self.lines, self.later = until, list[str](), list[float]()
 
-    def update(self, done: int, note: str = "") -> None:
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None:
+        self.later.append(later)
         if done > self.until:
             raise Killed
 
@@ -338,6 +339,9 @@ def test_a_longer_budget_goes_on_and_stretches_the_schedules(twenty: Path, tmp_p
     resume(longer, told)
     assert any("resuming" in line and line.endswith("at episode 20") for line in told.lines)
     assert any(line.endswith("train.episodes 20 -> 40") for line in told.lines)
+    # Nobody knows how long evaluations take before the first; then the last is counted, until it is done.
+    assert told.later[0] == 0 < told.later[-2] and told.later[-1] == 0
+    assert sum(later > 0 for later in told.later) >= 4
     for found, expected in zip(
         jax.tree.leaves(longer.policy().networks), jax.tree.leaves(by_hand.state.networks), strict=True
     ):
@@ -486,7 +490,7 @@ class Removes(Told):
         super().__init__()
         self.folder, self.copied = folder, copied
 
-    def update(self, done: int, note: str = "") -> None:
+    def update(self, done: int, note: str = "", later: float = 0.0) -> None:
         if done and self.folder.exists():
             if self.copied:
                 copy(self.folder, self.folder.parent / "copy")
