@@ -308,7 +308,8 @@ def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
     if array.ndim not in (1, 2) or array.shape[-1] != len(components) or not len(array):
         raise UserError(f"{name} takes {shape}, not an array of shape {array.shape}")
     rows = np.atleast_2d(array)
-    for i, row in enumerate(rows, 1):
-        if not np.isfinite(row).all():
-            raise UserError(f"{name} {i} is not finite: {' '.join(map(str, row.tolist()))}")
+    finite = np.isfinite(rows).all(1)
+    if not finite.all():
+        i = int(finite.argmin())
+        raise UserError(f"{name} {i + 1} is not finite: {' '.join(map(str, rows[i].tolist()))}")
     return rows

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from collections.abc import Callable
+from functools import cache, lru_cache, partial
+from inspect import signature
 from typing import Any
 
 import jax
@@ -16,11 +18,11 @@ from arm5dof.envs.base import Goal, Observation, vectors
 from arm5dof.envs.inverse_kinematics import Answer, Candidate
 from arm5dof.envs.paths import Path
 from arm5dof.errors import UserError
-from arm5dof.runtime import forks
+from arm5dof.runtime import forks, xla
 from arm5dof.runtime.tables import Table
 
-AT_ONCE = 16_384
-"""Goals in one device call: more take memory, and no less time each."""
+AT_ONCE = 4_096
+"""Goals in one device call: more take memory, and on a CPU, beyond its caches, more time each."""
 
 MOST_CORRECTIONS = 10_000
 
@@ -79,9 +81,7 @@ class Policy(struct.PyTreeNode, eq=False):
     @property
     def forward_model(self) -> ForwardModel:
         """The task, if it tells where an action leads. Raises `UserError` if it does not."""
-        if not isinstance(self.env, ForwardModel):
-            raise UserError(f"the task {type(self.env).__name__} has no forward model: its policy only acts")
-        return self.env
+        return _forward_model(self.env)
 
     def solve(
         self, *target: Any, corrections: int = 0, near: Any = None, candidates: bool = False, **inputs: Any
@@ -115,7 +115,7 @@ class Policy(struct.PyTreeNode, eq=False):
         if n <= AT_ONCE:
             answer = self._answer(goals, corrections, poses, candidates)
             return jax.tree.map(lambda x: x[0], answer) if single else answer
-        parts = []
+        parts, goals = [], jax.tree.map(np.asarray, goals)
         for first in range(0, n, AT_ONCE):
             # All are of one size, since another would be another program: the last begins again at the first goal.
             rows = np.arange(first, first + AT_ONCE) % n
@@ -256,15 +256,28 @@ class Policy(struct.PyTreeNode, eq=False):
         return self._table().html()
 
 
-@partial(jax.jit, static_argnames=("env", "corrections"))
+@lru_cache(maxsize=8)
+def _forward_model(env: Task) -> ForwardModel:
+    """See `Policy.forward_model`: to look whether a task has all of a protocol's attributes computes them."""
+    if not isinstance(env, ForwardModel):
+        raise UserError(f"the task {type(env).__name__} has no forward model: its policy only acts")
+    return env
+
+
 def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Candidate:
     """Compiled once for an environment and an agent, whatever the networks."""
-    return inverse_kinematics.solve(env, policy, goals, corrections)
+    return _compiled(inverse_kinematics.solve)(env, policy, goals, corrections)
 
 
-@partial(jax.jit, static_argnames=("env", "corrections", "branches"))
 def _ask(env: ForwardModel, policy: Policy, goals: Goal, corrections: int, branches: int | None) -> Candidate:
-    return inverse_kinematics.candidates(env, policy, goals, corrections, branches)
+    return _compiled(inverse_kinematics.candidates)(env, policy, goals, corrections, branches)
+
+
+@cache
+def _compiled(function: Callable[..., Candidate]) -> Callable[..., Candidate]:
+    """A function of `inverse_kinematics`: without physics, and with networks, which the emitters make twice as fast."""
+    static = [name for name in ("env", "corrections", "branches") if name in signature(function).parameters]
+    return jax.jit(function, static_argnames=static, compiler_options=xla.fusion_emitters())
 
 
 @partial(jax.jit, static_argnames="env")
