@@ -50,6 +50,7 @@ class Checkpoints:
     ) -> None:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
+        names_in(folder)
         self.folder = folder
         self._left_open = left_open
         # As a record gives them back: JSON has no tuples.
@@ -116,6 +117,11 @@ class Checkpoints:
     def check(self) -> dict[str, tuple[Any, Any]]:
         """Raise `UserError` if the newest checkpoint, where there is one, was made with other settings or is damaged.
         Returns what of the budget has changed since: from what to what, by name."""
+        if self.latest is None and (names := names_in(self.folder)):
+            raise UserError(
+                f"the checkpoints in {self.folder} ({', '.join(names)}) are damaged or none of ours: take them from a "
+                "copy of the run, or remove them to begin anew"
+            )
         record = {} if self.latest is None else self._record(self.latest)
         before = {**record.get("settings", {}), **record.get("budget", {})}
         return {name: (before[name], v) for name, v in self._budget.items() if name in before and before[name] != v}
@@ -170,6 +176,19 @@ class Checkpoints:
         """What is said of a checkpoint that cannot be read."""
         where = self.folder / str(step)
         return _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one")
+
+
+def names_in(folder: Path) -> list[str]:
+    """The names of the checkpoints in a folder, whole or not. Raises `UserError` if it is there and cannot be read."""
+    try:
+        return sorted((path.name for path in folder.iterdir() if path.name.isdigit()), key=int)
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise UserError(
+            f"the checkpoints in {folder} cannot be read ({error.strerror}): take them from a copy of the run, or make "
+            "them readable"
+        ) from None
 
 
 @contextlib.contextmanager

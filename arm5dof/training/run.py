@@ -24,7 +24,7 @@ from arm5dof.errors import FolderGoneError, UserError
 from arm5dof.runtime import files
 from arm5dof.runtime.tables import Table
 from arm5dof.training import config, curves, evaluate, robot
-from arm5dof.training.checkpoint import Checkpoints
+from arm5dof.training.checkpoint import Checkpoints, names_in
 from arm5dof.training.config import Config, make_env
 from arm5dof.training.policy import Policy
 from arm5dof.training.trainer import Trainer
@@ -160,12 +160,12 @@ class Run:
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether there is one to answer with and to go on from."""
-        return any(path.name.isdigit() for path in (self.folder / "checkpoints").glob("*"))
+        """Whether there is one to answer with and to go on from. Raises `UserError` if that cannot be read."""
+        return bool(names_in(self.folder / "checkpoints"))
 
     def policy(self) -> Policy:
-        """The policy of the newest checkpoint. Raises `UserError` if there is none, or it was made with other
-        settings."""
+        """The policy of the newest checkpoint. Raises `UserError` if there is none, it cannot be read, or it was made
+        with other settings."""
         if not self.has_checkpoint:
             raise UserError(f"{self.folder} has no checkpoint yet: resume it")
         checkpoints = self.checkpoints(read_only=True)
