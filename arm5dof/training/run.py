@@ -24,7 +24,8 @@ from arm5dof.errors import FolderGoneError, UserError
 from arm5dof.runtime import files
 from arm5dof.runtime.tables import Table
 from arm5dof.training import config, curves, evaluate, robot
-from arm5dof.training.checkpoint import Checkpoints, names_in
+from arm5dof.training.checkpoint import Checkpoints
+from arm5dof.training.checkpoint_folder import names_in
 from arm5dof.training.config import Config, make_env
 from arm5dof.training.policy import Policy
 from arm5dof.training.trainer import Trainer
@@ -90,7 +91,8 @@ class Run:
         return Run(folder, settings, frozenset(settings.flat().keys() - stated))
 
     def extend(self, **changes: Any) -> Run:
-        """The run with a longer budget, or others of its settings that may change. Its `config.toml` keeps them.
+        """The run with a longer budget, or others of its settings that may change, which its `config.toml` keeps from
+        now on; with those of `extended`, from when it is resumed.
 
         Step sizes, noise and the share of random actions are functions of the share of the budget that is done. A
         longer budget stretches them: 400 of 400 episodes become 400 of 800, and they rise again to where they stand
@@ -110,6 +112,13 @@ class Run:
         >>> run.extend(episodes=800).config.train.episodes, Run.open(run.folder).config.train.episodes
         (800, 800)
         """
+        with self.locked():
+            longer = self.extended(**changes)
+            with longer.keeping():
+                return longer
+
+    def extended(self, **changes: Any) -> Run:
+        """The same, and nothing is written: `config.toml` keeps them once `resume` has begun."""
         settings = config.override(self.config, changes)
         before, now, others = self.config.flat(), settings.flat(), config.may_change(self.config)
         changed = {name for name in before if now[name] != before[name]}
@@ -119,17 +128,26 @@ class Run:
                 f"{', '.join(shaped)}; what may change is {', '.join(others)}"
             )
         extended = Run(self.folder, settings, self.left_open - changed)
-        with self.locked():
-            made, checkpoints = extended.trainer(), extended.checkpoints(read_only=True)
-            checkpoints.check()
-            done = (checkpoints.latest or 0) * settings.train.num_envs // made.env.episode_length
-            if settings.train.episodes < done and "train.episodes" in changed:
-                raise UserError(
-                    f"{self.folder} has trained {done} episodes, more than {settings.train.episodes}: give {done} or "
-                    "more, or train a new run"
-                )
-            files.write_text(self.folder / "config.toml", config.dumps(settings, extended.left_open))
+        made, checkpoints = extended.trainer(), extended.checkpoints(read_only=True)
+        checkpoints.check()
+        done = (checkpoints.latest or 0) * settings.train.num_envs // made.env.episode_length
+        if settings.train.episodes < done and "train.episodes" in changed:
+            raise UserError(
+                f"{self.folder} has trained {done} episodes, more than {settings.train.episodes}: give {done} or "
+                "more, or train a new run"
+            )
         return extended
+
+    @contextmanager
+    def keeping(self) -> Iterator[None]:
+        """Where `config.toml` says something else, let it say what the run's configuration is, once the block succeeds:
+        what that takes of the disk is taken before."""
+        if Run.open(self.folder).config == self.config:
+            yield
+            return
+        with files.replacing(self.folder / "config.toml") as temporary:
+            temporary.write_text(config.dumps(self.config, self.left_open), encoding="utf-8")
+            yield
 
     @cached_property
     def env(self) -> Task:

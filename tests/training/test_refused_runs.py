@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from helpers.errors import said
 
 from arm5dof.cli import main as cli
 from arm5dof.training.config import load_config
-from arm5dof.training.loop import train
+from arm5dof.training.loop import resume, train
 from arm5dof.training.run import Run
 
 TINY = {
@@ -61,10 +62,47 @@ def test_checkpoints_that_cannot_be_read_are_not_taken_for_none(folder: Path, ha
     assert "has no checkpoint yet: resume it" in said(Run.open(folder).policy)
 
 
+LONGER = ("--episodes", "8")
+
+
+@pytest.mark.parametrize("damaged", ["checkpoints/32/training/manifest.ocdbt", "evaluations.json", "metrics.csv"])
+def test_a_resume_that_is_refused_changes_nothing(folder: Path, damaged: str, capfd):
+    """Nor does it keep the longer budget."""
+    (folder / damaged).write_bytes(b"damaged\n1\n")
+    before = content(folder)
+    assert cli.main(["train", "--resume", str(folder), *LONGER]) == 2
+    assert "damaged" in capfd.readouterr().err.splitlines()[-1]
+    assert content(folder) == before
+
+
+@pytest.mark.parametrize("limit", [100, 4096])
+def test_a_resume_on_a_full_disk_changes_nothing(folder: Path, limit: int):
+    """Past its file-size limit a process gets the errors of a full disk: of the configuration, or of checkpoints."""
+    code = (
+        "import resource, sys; from arm5dof.cli.main import main;"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); sys.exit(main(sys.argv[1:]))"
+    )
+    before = content(folder)
+    words = [sys.executable, "-c", code, "train", "--resume", folder, *LONGER]
+    done = subprocess.run(
+        words, capture_output=True, text=True, env={**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    )
+    assert done.returncode == 2 and "File too large" in done.stderr.splitlines()[-1], done.stderr
+    assert content(folder) == before
+    assert cli.main(["train", "--resume", str(folder), *LONGER]) in (0, 1)
+    assert Run.open(folder).config.train.episodes == Run.open(folder).evaluations[-1]["episodes"] == 8
+
+
+def test_what_is_extended_for_one_resume_is_kept_when_that_begins(folder: Path):
+    run = Run.open(folder).extended(episodes=8)
+    assert Run.open(folder).config.train.episodes == 4
+    assert Run.open(resume(run).folder) == run
+
+
 def test_checkpoints_that_one_may_not_read(folder: Path):
     (folder / "checkpoints").chmod(0)
     code = (
-        "import os, sys; from pathlib import Path; from arm5dof.training.checkpoint import names_in\n"
+        "import os, sys; from pathlib import Path; from arm5dof.training.checkpoint_folder import names_in\n"
         "if os.geteuid() == 0: os.seteuid(65534)\n"  # Root may read all.
         "names_in(Path(sys.argv[1]))"
     )
