@@ -1,6 +1,6 @@
 """A run and its folder, which holds all that it takes to go on or to answer, anywhere:
 
-`config.toml`, `run.json` (versions), `model.mjb.gz` and `model.zip` (the robot), `metrics.csv`, `evaluations.json`,
+`config.toml`, `run.json` (id, versions), `model.mjb.gz` and `model.zip` (the robot), `metrics.csv`, `evaluations.json`,
 `checkpoints/`, `learning.png` and `report.md`; with loggers `tensorboard/`, `wandb/` and `wandb.json`.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ class Run:
             (temporary / "config.toml").write_text(config.dumps(settings), encoding="utf-8")
             model = robot.keep(temporary, env)
             versions = {name: metadata.version(name) for name in VERSIONS}
-            record = {"versions": versions, "device": device(), "model": model}
+            record = {curves.RUN: uuid.uuid4().hex, "versions": versions, "device": device(), "model": model}
             (temporary / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         return Run(folder, settings)
 
@@ -200,13 +201,14 @@ class Run:
 
     @property
     def metrics(self) -> dict[str, list[float]]:
-        """The columns of `metrics.csv`, an epoch each: counters, seconds, and means over the epoch in SI units."""
+        """The columns of `metrics.csv`, an epoch each: counters, seconds, and means over the epoch in SI units. Raises
+        `UserError` if it is damaged or of another run."""
         rows = curves.read_rows(self.folder)
         return {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ())}
 
     @property
     def evaluations(self) -> list[dict[str, Any]]:
-        """The evaluations so far: counters, `targets`, and what `evaluate` returns."""
+        """The evaluations so far: counters, `targets`, and what `evaluate` returns. Raises `UserError` as `metrics`."""
         return curves.read_evaluations(self.folder, config.task_class(self.config.task).metrics)
 
     def checkpoints(self, read_only: bool = False) -> Checkpoints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 from helpers.errors import said
 
 from arm5dof.cli import main as cli
+from arm5dof.sweeps.compare import compare
 from arm5dof.training.config import load_config
 from arm5dof.training.loop import resume, train
 from arm5dof.training.run import Run
@@ -97,6 +99,59 @@ def test_what_is_extended_for_one_resume_is_kept_when_that_begins(folder: Path):
     run = Run.open(folder).extended(episodes=8)
     assert Run.open(folder).config.train.episodes == 4
     assert Run.open(resume(run).folder) == run
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another finished run of the same settings, all but the seed."""
+    return train(load_config("kinematic.toml", seed=1, **TINY), tmp_path_factory.mktemp("runs") / "other").folder
+
+
+def without_ids(folder: Path) -> None:
+    """Make a run one of before there were ids."""
+    record = json.loads((folder / "run.json").read_text())
+    del record["run"]
+    (folder / "run.json").write_text(json.dumps(record))
+    evaluations = json.loads((folder / "evaluations.json").read_text())
+    (folder / "evaluations.json").write_text(
+        json.dumps([{**e, "run": None} for e in evaluations]).replace(', "run": null', "")
+    )
+    lines = (folder / "metrics.csv").read_text().splitlines()
+    (folder / "metrics.csv").write_text("".join(line.rpartition(",")[0] + "\n" for line in lines))
+
+
+@pytest.mark.parametrize("older", [set(), {"run"}, {"other"}])
+@pytest.mark.parametrize("name", ["metrics.csv", "evaluations.json"])
+def test_curves_of_another_run_are_refused(
+    folder: Path, other: Path, tmp_path: Path, name: str, older: set[str], capfd
+):
+    """Also where either run is of before there were ids."""
+    copied = Path(shutil.copytree(other, tmp_path / "other"))
+    for place in (folder, copied):
+        if place.name in older:
+            without_ids(place)
+    shutil.copy(copied / name, folder / name)
+    before = content(folder)
+    run = Run.open(folder)
+    reads = (lambda: run.metrics) if name == "metrics.csv" else (lambda: run.evaluations)
+    for call in (reads, lambda: compare(folder), lambda: resume(run)):
+        assert f"{folder / name} is of another run: take it from a copy of the run, or remove it to go on" in said(call)
+    for words in (["compare", folder], ["train", "--resume", folder, *LONGER]):
+        assert cli.main([str(word) for word in words]) == 2
+        assert f"{name} is of another run: " in capfd.readouterr().err.splitlines()[-1]
+    assert content(folder) == before
+
+
+def test_runs_of_before_there_were_ids_go_on_without(folder: Path):
+    whole = Run.open(folder)
+    metrics, evaluations = whole.metrics, whole.evaluations
+    assert len(metrics["steps"]) == 4 and len(evaluations) == 2 and "run" not in metrics and "run" not in evaluations[0]
+    without_ids(folder)
+    run = Run.open(folder)
+    assert run.metrics == metrics and run.evaluations == evaluations
+    longer = resume(run.extended(episodes=6))
+    assert longer.evaluations[:2] == evaluations and longer.evaluations[-1]["episodes"] == 6
+    assert longer.metrics["steps"][:4] == metrics["steps"] and len(longer.metrics["steps"]) == 6
 
 
 def test_checkpoints_that_one_may_not_read(folder: Path):
