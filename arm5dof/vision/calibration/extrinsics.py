@@ -163,7 +163,8 @@ def board_spread(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndar
     shift along them."""
     carry, (x, y, z) = np.eye(6), board[:3, 3]
     carry[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]  # The camera's turn by w moves the board's origin p by p x w.
-    return carry @ pose_covariance(camera, corners, board) @ carry.T
+    # Hand-eye calibration finds out by what factor that is too small.
+    return carry @ pose_covariance(camera, corners, board, independent=True) @ carry.T
 
 
 def find(camera: Camera, path: Path, board: Board) -> Corners | None:
