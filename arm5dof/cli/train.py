@@ -101,7 +101,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
             raise UserError(f"--resume goes on with a run as it was configured; leave out {', '.join(others)}")
         current = runs.Run.open(args.resume)
         _check_options(current.config, texts)
-        current = current.extend(**texts) if texts else current
+        current = current.extended(**texts) if texts else current
         trainer = None
     else:
         experiment = experiment or "reach.toml"

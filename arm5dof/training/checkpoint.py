@@ -13,7 +13,6 @@ import hashlib
 import json
 import logging
 import sys
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -25,10 +24,10 @@ import numpy as np
 
 from arm5dof.ddpg import Networks, Training
 from arm5dof.errors import UserError
+from arm5dof.training.checkpoint_folder import check_room, names_in, plain
 
 T = TypeVar("T")
 KEEP = 2
-SPECIAL = frozenset("*?[]\\")
 
 
 class Checkpoints:
@@ -50,6 +49,7 @@ class Checkpoints:
     ) -> None:
         import orbax.checkpoint as ocp  # Takes half a second, which what needs no checkpoint does without.
 
+        names_in(folder)
         self.folder = folder
         self._left_open = left_open
         # As a record gives them back: JSON has no tuples.
@@ -64,7 +64,7 @@ class Checkpoints:
         )
         self._open = contextlib.ExitStack()
         with _as_user_error(f"cannot open the checkpoints in {folder}"):
-            path = self._open.enter_context(_plain(folder.resolve(), create=not read_only))
+            path = self._open.enter_context(plain(folder.resolve(), create=not read_only))
             self._manager = ocp.CheckpointManager(path, options=options)
         self._open.callback(self._manager.close)
 
@@ -104,6 +104,11 @@ class Checkpoints:
                 self._manager.delete(step)
                 raise
 
+    def check_room(self) -> None:
+        """Raise `UserError` unless another checkpoint like the newest can be written."""
+        if self.latest is not None:
+            check_room(self.folder, self.folder / str(self.latest))
+
     def restore(self, like: Training) -> Training:
         """The newest checkpoint, bit for bit. `like` gives shapes and types (`jax.eval_shape` of `DDPG.init`)."""
         rest = self._read("training", like.replace(networks=None))
@@ -116,6 +121,11 @@ class Checkpoints:
     def check(self) -> dict[str, tuple[Any, Any]]:
         """Raise `UserError` if the newest checkpoint, where there is one, was made with other settings or is damaged.
         Returns what of the budget has changed since: from what to what, by name."""
+        if self.latest is None and (names := names_in(self.folder)):
+            raise UserError(
+                f"the checkpoints in {self.folder} ({', '.join(names)}) are damaged or none of ours: take them from a "
+                "copy of the run, or remove them to begin anew"
+            )
         record = {} if self.latest is None else self._record(self.latest)
         before = {**record.get("settings", {}), **record.get("budget", {})}
         return {name: (before[name], v) for name, v in self._budget.items() if name in before and before[name] != v}
@@ -170,23 +180,6 @@ class Checkpoints:
         """What is said of a checkpoint that cannot be read."""
         where = self.folder / str(step)
         return _as_user_error(f"the checkpoint {where} is damaged or not one of ours; remove it to use an older one")
-
-
-@contextlib.contextmanager
-def _plain(folder: Path, create: bool) -> Iterator[Path]:
-    """A path to a folder without the characters that orbax takes for patterns and tensorstore for separators: the
-    folder's own, or a link to it."""
-    if not SPECIAL & set(str(folder)):
-        yield folder
-        return
-    if create:
-        folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="arm5dof-") as place:
-        if SPECIAL & set(place):
-            raise UserError(f"checkpoints need a folder for temporary files without any of {' '.join(sorted(SPECIAL))}")
-        link = Path(place) / "checkpoints"
-        link.symlink_to(folder, target_is_directory=True)
-        yield link
 
 
 def _abstract(leaves: Mapping[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:

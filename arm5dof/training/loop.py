@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -151,7 +151,13 @@ def _train(
     before = rows[-1]["seconds"] if rows else 0.0
     started = time.monotonic()
 
-    with curves.appending(run.folder, rows) as write, logging(run, loggers, rows, evaluations) as log:
+    if not made.finished:
+        checkpoints.check_room()
+    with ExitStack() as stack:
+        # Nothing of the run changes before all that can be refused has been.
+        with run.keeping():
+            write = stack.enter_context(curves.appending(run.folder, rows))
+        log = stack.enter_context(logging(run, loggers, rows, evaluations))
         try:
             while True:
                 at = made.counters

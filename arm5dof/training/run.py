@@ -1,6 +1,6 @@
 """A run and its folder, which holds all that it takes to go on or to answer, anywhere:
 
-`config.toml`, `run.json` (versions), `model.mjb.gz` and `model.zip` (the robot), `metrics.csv`, `evaluations.json`,
+`config.toml`, `run.json` (id, versions), `model.mjb.gz` and `model.zip` (the robot), `metrics.csv`, `evaluations.json`,
 `checkpoints/`, `learning.png` and `report.md`; with loggers `tensorboard/`, `wandb/` and `wandb.json`.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from arm5dof.runtime import files
 from arm5dof.runtime.tables import Table
 from arm5dof.training import config, curves, evaluate, robot
 from arm5dof.training.checkpoint import Checkpoints
+from arm5dof.training.checkpoint_folder import names_in
 from arm5dof.training.config import Config, make_env
 from arm5dof.training.policy import Policy
 from arm5dof.training.trainer import Trainer
@@ -67,7 +69,7 @@ class Run:
             (temporary / "config.toml").write_text(config.dumps(settings), encoding="utf-8")
             model = robot.keep(temporary, env)
             versions = {name: metadata.version(name) for name in VERSIONS}
-            record = {"versions": versions, "device": device(), "model": model}
+            record = {curves.RUN: uuid.uuid4().hex, "versions": versions, "device": device(), "model": model}
             (temporary / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         return Run(folder, settings)
 
@@ -90,7 +92,8 @@ class Run:
         return Run(folder, settings, frozenset(settings.flat().keys() - stated))
 
     def extend(self, **changes: Any) -> Run:
-        """The run with a longer budget, or others of its settings that may change. Its `config.toml` keeps them.
+        """The run with a longer budget, or others of its settings that may change, which its `config.toml` keeps from
+        now on; with those of `extended`, from when it is resumed.
 
         Step sizes, noise and the share of random actions are functions of the share of the budget that is done. A
         longer budget stretches them: 400 of 400 episodes become 400 of 800, and they rise again to where they stand
@@ -110,6 +113,13 @@ class Run:
         >>> run.extend(episodes=800).config.train.episodes, Run.open(run.folder).config.train.episodes
         (800, 800)
         """
+        with self.locked():
+            longer = self.extended(**changes)
+            with longer.keeping():
+                return longer
+
+    def extended(self, **changes: Any) -> Run:
+        """The same, and nothing is written: `config.toml` keeps them once `resume` has begun."""
         settings = config.override(self.config, changes)
         before, now, others = self.config.flat(), settings.flat(), config.may_change(self.config)
         changed = {name for name in before if now[name] != before[name]}
@@ -119,17 +129,26 @@ class Run:
                 f"{', '.join(shaped)}; what may change is {', '.join(others)}"
             )
         extended = Run(self.folder, settings, self.left_open - changed)
-        with self.locked():
-            made, checkpoints = extended.trainer(), extended.checkpoints(read_only=True)
-            checkpoints.check()
-            done = (checkpoints.latest or 0) * settings.train.num_envs // made.env.episode_length
-            if settings.train.episodes < done and "train.episodes" in changed:
-                raise UserError(
-                    f"{self.folder} has trained {done} episodes, more than {settings.train.episodes}: give {done} or "
-                    "more, or train a new run"
-                )
-            files.write_text(self.folder / "config.toml", config.dumps(settings, extended.left_open))
+        made, checkpoints = extended.trainer(), extended.checkpoints(read_only=True)
+        checkpoints.check()
+        done = (checkpoints.latest or 0) * settings.train.num_envs // made.env.episode_length
+        if settings.train.episodes < done and "train.episodes" in changed:
+            raise UserError(
+                f"{self.folder} has trained {done} episodes, more than {settings.train.episodes}: give {done} or "
+                "more, or train a new run"
+            )
         return extended
+
+    @contextmanager
+    def keeping(self) -> Iterator[None]:
+        """Where `config.toml` says something else, let it say what the run's configuration is, once the block succeeds:
+        what that takes of the disk is taken before."""
+        if Run.open(self.folder).config == self.config:
+            yield
+            return
+        with files.replacing(self.folder / "config.toml") as temporary:
+            temporary.write_text(config.dumps(self.config, self.left_open), encoding="utf-8")
+            yield
 
     @cached_property
     def env(self) -> Task:
@@ -160,12 +179,12 @@ class Run:
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether there is one to answer with and to go on from."""
-        return any(path.name.isdigit() for path in (self.folder / "checkpoints").glob("*"))
+        """Whether there is one to answer with and to go on from. Raises `UserError` if that cannot be read."""
+        return bool(names_in(self.folder / "checkpoints"))
 
     def policy(self) -> Policy:
-        """The policy of the newest checkpoint. Raises `UserError` if there is none, or it was made with other
-        settings."""
+        """The policy of the newest checkpoint. Raises `UserError` if there is none, it cannot be read, or it was made
+        with other settings."""
         if not self.has_checkpoint:
             raise UserError(f"{self.folder} has no checkpoint yet: resume it")
         checkpoints = self.checkpoints(read_only=True)
@@ -182,13 +201,14 @@ class Run:
 
     @property
     def metrics(self) -> dict[str, list[float]]:
-        """The columns of `metrics.csv`, an epoch each: counters, seconds, and means over the epoch in SI units."""
+        """The columns of `metrics.csv`, an epoch each: counters, seconds, and means over the epoch in SI units. Raises
+        `UserError` if it is damaged or of another run."""
         rows = curves.read_rows(self.folder)
         return {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ())}
 
     @property
     def evaluations(self) -> list[dict[str, Any]]:
-        """The evaluations so far: counters, `targets`, and what `evaluate` returns."""
+        """The evaluations so far: counters, `targets`, and what `evaluate` returns. Raises `UserError` as `metrics`."""
         return curves.read_evaluations(self.folder, config.task_class(self.config.task).metrics)
 
     def checkpoints(self, read_only: bool = False) -> Checkpoints:

@@ -21,5 +21,7 @@ class Frame:
     """RGB uint8 (h, w, 3)."""
     time: float | None = None
     """Seconds since the beginning of the video, or since the camera's first frame; None for a photograph."""
+    turned: bool = False
+    """Whether it was turned or mirrored as the photograph's EXIF orientation tag says."""
     camera: Camera | None = None
     """The camera that a simulated image was rendered for, known exactly; None for real images."""

@@ -6,6 +6,8 @@ Everywhere else an image is RGB, uint8, (h, w, 3).
 from __future__ import annotations
 
 import warnings
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,11 @@ from arm5dof.vision.opencv import overheard
 
 ORIENTATION_TAG = 0x0112
 """Of EXIF."""
+
+
+class ImageError(UserError):
+    """A file is no image that can be used. Of several files the others may be."""
+
 
 GREY = 114
 """The borders of a letterboxed image, as YOLO networks were trained with."""
@@ -34,46 +41,55 @@ def read(path: str | Path, upright: bool = True) -> np.ndarray:
         RGB uint8 (h, w, 3).
 
     Raises:
-        UserError: There is no such file, or it is damaged or no image.
+        ImageError: There is no such file, it cannot be read, or it is damaged or no image.
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"no image {path}: give the path of an image file")
+        raise ImageError(f"no image {path}: give the path of an image file")
     orientation = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
     pixels = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | orientation)
-    if pixels is None:
-        raise UserError(f"{path} is empty, damaged, or no image that OpenCV reads: give a JPEG or PNG file")
     try:
         return rgb(pixels[..., ::-1])
     except UserError as error:
-        raise UserError(f"{path}: {error}") from None
+        raise ImageError(f"{path}: {error}") from None
 
 
-def decode(path: Path, flags: int) -> np.ndarray | None:
+def decode(path: Path, flags: int, wanted: str = "a JPEG or PNG file") -> np.ndarray:
     """Read an image file as OpenCV has it.
 
     Args:
         path: The file.
         flags: OpenCV's `IMREAD_...`.
+        wanted: What to give instead of a file that is none.
 
     Returns:
-        Its pixels, or None if it is no image, or too damaged for one.
+        Its pixels.
 
     Warns:
         UserWarning: The library that reads JPEG found damage, and filled in what was missing.
 
     Raises:
-        OSError: It cannot be read.
+        ImageError: It cannot be read, is no image, has more pixels than OpenCV reads, or is too damaged.
     """
-    content = np.frombuffer(path.read_bytes(), np.uint8)
     try:
-        with overheard() as said:
-            pixels = cv2.imdecode(content, flags) if content.size else None
-    except cv2.error:
-        return None
-    if pixels is not None and (damage := [line for line in said if "Corrupt JPEG" in line]):
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read: {error.strerror or error}") from None
+    pixels = None
+    with suppress(cv2.error), overheard() as said:
+        pixels = cv2.imdecode(content, flags) if content.size else None
+    if pixels is None:
+        raise ImageError(f"{path} is empty, damaged, or no image that OpenCV reads: give {wanted}")
+    if damage := [line for line in said if "Corrupt JPEG" in line]:
         warnings.warn(f"{path} may be damaged, look at it: {damage[0]}", stacklevel=3)
     return pixels
+
+
+def check_some_usable(problems: Collection[str], files: int) -> None:
+    """Raise `UserError` if there are problems, one a file, with all of so many files."""
+    if problems and len(problems) == files:
+        more = f"; and none of the {files - 1} others can be used" if files > 1 else ""
+        raise UserError(f"{next(iter(problems))}{more}")
 
 
 def has_orientation(path: str | Path) -> bool:

@@ -47,18 +47,18 @@ def environment(**changes: str | None) -> dict[str, str]:
 
 def fingerprint(run: Path) -> dict[str, Any]:
     """What a training has come to, bit for bit: digests of its newest checkpoint, its curves without the clock, and its
-    evaluations."""
+    evaluations, whichever run that is."""
     step = max((p for p in (run / "checkpoints").iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
     record = json.loads((step / "record" / "metadata").read_text())
     with open(run / "metrics.csv", newline="") as file:
-        rows = [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+        rows = [{k: v for k, v in row.items() if k not in ("seconds", "run")} for row in csv.DictReader(file)]
     curves = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
     digests = {name: record[name]["sha256"] for name in ("networks", "training")}
     return {
         "step": step.name,
         **digests,
         "rows": curves,
-        "evaluations": json.loads((run / "evaluations.json").read_text()),
+        "evaluations": [e | {"run": None} for e in json.loads((run / "evaluations.json").read_text())],
     }
 
 

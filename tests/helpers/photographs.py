@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -75,6 +77,17 @@ def matrix(rotation: Rotation, position: Sequence[float]) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
     return pose
+
+
+def vast_png(bits: int = 8) -> bytes:
+    """A PNG file whose header tells of 40000 x 40000 pixels, more than OpenCV reads."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", 40000, 40000, bits, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
 
 
 CAMERA = matrix(Rotation.from_euler("xyz", [0.4, -0.3, 1.1]), [0.05, -0.02, 0.04])

@@ -29,7 +29,8 @@ middle and in the corners of the image. Do not move zoom or focus between them.
 
 A checkerboard is counted in inner corners, where four squares meet: one of 10 x 7 squares has 9x6. A ChArUco board is
 counted in squares. The result goes into a YAML file in OpenCV's format. Judge it by the +- of the intrinsics rather
-than by the error in pixels: few photographs fit well and say little. Exit status 2, and nothing written, if the
+than by the error in pixels: few photographs fit well and say little. A file that cannot be read is named and left out,
+as is a photograph without the board; the exit status is still 0. Exit status 2, and nothing written, if the
 photographs are too few, show another board, leave the intrinsics uncertain, or were taken by a lens that another model
 describes much better: that of --lens fisheye, or eight coefficients, which wide lenses want.
 """
@@ -70,6 +71,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     options.say_untagged(paths)
     with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
         views = find_views(paths, board, progress)
+    options.say_unread(views.unread)
     with options.lens_remedy():
         result = calibrate(views, args.distortion, args.lens)
     # Both files or none: the preview takes its place when the camera has been written.
@@ -87,7 +89,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
 def calibration_table(views: BoardViews, result: Calibration) -> str:
     """What a calibration found, for people."""
-    width = max(len(name) for name in [*result.errors, *result.outliers, *result.copies, *views.without, "photograph"])
+    names = ["photograph", *result.errors, *result.outliers, *result.copies, *views.without, *views.unread]
+    width = max(map(len, names))
     lines = [f"{'photograph':{width}}  error, pixels"]
     lines += [f"{name:{width}}  {error:.3f}" for name, error in result.errors.items()]
     lines += [
@@ -95,6 +98,7 @@ def calibration_table(views: BoardViews, result: Calibration) -> str:
     ]
     lines += [f"{name:{width}}  -      left out: the same as {first}" for name, first in result.copies.items()]
     lines += [f"{name:{width}}  -      left out: board not found" for name in views.without]
+    lines += [f"{name:{width}}  -      left out: cannot be read" for name in views.unread]
     lines += ["", f"{'intrinsic':{width}}  value +- standard deviation"]
     for name, value, deviation in zip(result.names, result.intrinsics, result.deviations, strict=True):
         digits, unit = (2, " pixels") if name[0] in "fc" else (5, "")
@@ -117,4 +121,5 @@ def as_json(views: BoardViews, result: Calibration) -> dict[str, Any]:
         "outliers_px": result.outliers,
         "copies": result.copies,
         "without_board": views.without,
+        "unread": views.unread,
     }

@@ -37,14 +37,16 @@ The shipped detector finds the objects of our catalogue on a table. MODEL is a f
   arm5dof vision detect 0 --detector yolov5n.pt --size 320 --out found       until Ctrl-C
 
 Without --out a table is printed. With it a new folder gets the images, or the video as MP4, with the boxes drawn in,
-and detections.json: a list with an object for each frame, {"name", "time_s", "image_size", "detections"}, and in that
-for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
+and detections.json: a list with an object for each frame, {"name", "time_s", "image_size", "turned", "detections"}, and
+in that for each box {"class_name", "class_id", "confidence", "xyxy"}, the edges left, top, right and bottom in pixels.
+Photographs are turned as their EXIF orientation tags say; "turned" is true where one says something.
 
 Faster: a smaller --size. Too little is found: --tta, or a lower --confidence; too much: a higher one. One object is
 found twice: a lower --iou, of which networks such as YOLOv10 and 26 take no notice.
 
-If an image is damaged, a video breaks off or you press Ctrl-C, the frames before are written and the files are whole;
-the exit status is then 2, or 130 for Ctrl-C. A camera goes on until Ctrl-C, so there the exit status is 0.
+An image that is damaged, or none, is named and left out; the exit status is then 1, or 2 if no image is left. If a
+video breaks off or you press Ctrl-C, the frames before are written and the files are whole; the exit status is then 2,
+or 130 for Ctrl-C. A camera goes on until Ctrl-C, so there the exit status is 0.
 """
 
 

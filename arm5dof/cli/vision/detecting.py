@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from arm5dof.errors import UserError
 
 if TYPE_CHECKING:
+    from arm5dof.runtime.progress import Bar
     from arm5dof.vision.io.sinks import Write
     from arm5dof.vision.io.sources import Source
 
@@ -61,10 +62,11 @@ def run(
         named: Classes that the command line speaks of, besides those to look for.
 
     Returns:
-        The exit status.
+        The exit status: 1 if photographs were left out, each of which is named.
 
     Raises:
-        UserError: The detector knows no such class; or it cannot go on, and what came before is kept.
+        UserError: The detector knows no such class, there is something wrong with all photographs; or it cannot go on,
+            and what came before is kept.
     """
     if args.out is not None and args.out.exists():
         raise UserError(f"{args.out} exists: choose another --out")
@@ -74,9 +76,10 @@ def run(
     from arm5dof.runtime.progress import Bar
     from arm5dof.vision.detections import check_known
     from arm5dof.vision.detectors.loading import detect, load_detector, read_names
+    from arm5dof.vision.images import ImageError, check_some_usable
 
     names = None if args.names is None else read_names(args.names)
-    failure, total, done, started = None, Counter[str](), 0, time.monotonic()
+    failure, total, done, told, started = None, Counter[str](), 0, 0, time.monotonic()
     with closing(source.frames), Bar("detecting", source.length, "frames") as bar:
         bar.update(0, "reading the detector")
         detector = load_detector(args.detector, names, args.confidence, args.iou, args.size, args.tta, args.onnxruntime)
@@ -88,14 +91,23 @@ def run(
         with outputs as writers, interruptible() as interrupts:
             try:
                 for frame, found in results:
-                    for write in writers:
-                        write(frame, found)
+                    try:
+                        for write in writers:
+                            write(frame, found)
+                    except ImageError as error:
+                        if source.rate is not None:  # Its other frames are no better.
+                            raise
+                        source.unread.append(str(error))
+                        continue
                     done += 1
+                    told = _tell(source.unread, told, bar)
                     in_frame = Counter(found.data["class_name"].tolist())
                     total += in_frame
                     bar.update(done, _counted(in_frame))
                     if interrupts:
                         break
+                check_some_usable(source.unread, done + len(source.unread))
+                _tell(source.unread, told, bar)
             except UserError as error:
                 if not done:
                     raise
@@ -111,7 +123,17 @@ def run(
         print(f"{frames} in {time.monotonic() - started:.1f} s: {_counted(total)}")
         if args.out is not None:
             print(f"written: {args.out}")
-    return 0
+    if source.unread:
+        left_out, of = len(source.unread), done + len(source.unread)
+        print(f"arm5dof: {left_out} of {of} files left out, for the reasons above", file=sys.stderr)
+    return int(bool(source.unread))
+
+
+def _tell(lines: Sequence[str], told: int, bar: Bar) -> int:
+    """Print those that have not been told yet. Returns how many have been now."""
+    for line in lines[told:]:
+        bar.say(f"arm5dof: {line}")
+    return len(lines)
 
 
 @contextmanager

@@ -28,7 +28,8 @@ quaternion.
 
   arm5dof vision hand-eye camera.yml poses.csv --eye-in-hand --board 9x6 --square 0.025 --out on_hand.yml
 
-How exact the hand is, is estimated too. Poses that contradict the others are named and left out, up to a quarter.
+How exact the hand is, is estimated too. Poses that contradict the others are named and left out, up to a quarter; so
+are photographs that do not show the board or cannot be read.
 
 The pose goes into a new file beside the intrinsics, with the covariance of both. That of a camera on the hand is in the
 hand's frame: arm5dof vision locate takes the hand's pose with it.
@@ -65,6 +66,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     options.say_untagged(paths)
     with late_bar("looking for the board", len(paths), "photographs") as progress, options.board_remedy():
         found = from_hand(camera, hands, paths, board, args.eye_in_hand, progress)
+    options.say_unread(found.unread)
     found.save(args.out, board)
 
     frame, left = "hand" if args.eye_in_hand else "base", found.hand_eye
@@ -73,6 +75,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         more = {"frame": frame, "rotation_deg": left.rotation_deg, "translation_m": left.translation_m}
         more |= {"hand_rotation_deg": turn_deg, "hand_translation_m": shift}
         more |= {"used": found.used, "without_board": found.without, "outliers": found.outliers}
+        more |= {"unread": found.unread}
         print(files.to_json(camera_report.as_json(found.camera) | more))
         return
     print(camera_report.pose_table(found.camera, frame))
@@ -83,4 +86,6 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         print(f"{name}: left out: {degrees:.1f} degrees and {1e3 * metres:.0f} mm off: is the hand's pose right?")
     for name in found.without:
         print(f"{name}: left out: board not found")
+    for name in found.unread:
+        print(f"{name}: left out: cannot be read")
     print(f"camera: {args.out}")

@@ -58,12 +58,13 @@ Printed are millimetres, and standard deviations that follow from those of the c
 image (--depth-error) and the heights (half a millimetre), and from how objects are turned, which no box tells. With
 --json: a list of frames, {"name", "objects"}, and in that for each detection {"class_name", "confidence", "position",
 "covariance", "reason"}, metres and square metres in the base frame; what cannot be located has null for both, and a
-reason. Of images there are also each frame's "time_s" and "image_size", and each object's "class_id" and "xyxy", as in
-vision detect.
+reason. Of images there are also each frame's "time_s", "image_size" and "turned", and each object's "class_id" and
+"xyxy", as in vision detect.
 
 With --out a new folder gets positions.json, which is that list, and the images, or the video as MP4, in which each box
-has its class and x, y and z in millimetres, or the reason. An interrupted or damaged source leaves whole files of the
-frames before, as with vision detect.
+has its class and x, y and z in millimetres, or the reason. An image that is damaged, or not of the camera's size, is
+named and left out; the exit status is then 1, or 2 if no image is left. An interrupted or damaged video leaves whole
+files of the frames before, as with vision detect.
 """
 
 
@@ -272,7 +273,9 @@ def _read_moments(paths: Sequence[Path], cameras: Sequence[Camera]) -> list[tupl
         for frame in frames:
             if frame.size is not None:
                 _check_size(frame.name, frame.size, camera)
-            if frame.name is not None and has_orientation(frame.name):
+            # Files from before that was noted leave it to the photograph, where it still is.
+            looked_up = frame.turned is None and frame.name is not None and has_orientation(frame.name)
+            if frame.turned or looked_up:
                 raise UserError(
                     f"{frame.name} has an orientation tag, by which it was turned before it was detected in: give the "
                     "photograph itself, as the sensor saw it, in place of its detections"
@@ -308,10 +311,12 @@ def _note_unseen(named: Sequence[str], seen: set[str]) -> None:
 
 
 def _check_size(name: str | None, size: tuple[int, ...], camera: Camera) -> None:
-    """Raise `UserError` unless an image of that width and height is one of the camera's."""
+    """Raise `ImageError` unless an image of that width and height is one of the camera's."""
+    from arm5dof.vision.images import ImageError
+
     if size != (camera.width, camera.height):
         width, height = size
-        raise UserError(f"{name} has {width}x{height} pixels and the camera {camera.width}x{camera.height}")
+        raise ImageError(f"{name} has {width}x{height} pixels and the camera {camera.width}x{camera.height}")
 
 
 def _is_list(given: str) -> bool:

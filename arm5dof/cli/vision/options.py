@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +50,12 @@ def say_untagged(paths: Iterable[Path]) -> None:
             "sensor's pixels",
             file=sys.stderr,
         )
+
+
+def say_unread(unread: Mapping[str, str]) -> None:
+    """Say what is wrong with each file that was left out since it cannot be read."""
+    for reason in unread.values():
+        print(f"arm5dof: left out: {reason}", file=sys.stderr)
 
 
 @contextmanager

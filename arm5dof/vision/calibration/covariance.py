@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.calibration.corner_noise import corner_covariance
 from arm5dof.vision.calibration.evidence import evidence, intrinsics_covariance
 from arm5dof.vision.camera import Camera
 
@@ -62,20 +63,24 @@ def add_pose(camera: Camera, solve: Callable[[Camera], np.ndarray], noise: np.nd
     return placed.replace(covariance=np.block([[lens, both], [both.T, follows @ both + noise]]))
 
 
-def pose_covariance(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndarray:
+def pose_covariance(camera: Camera, corners: Corners, board: np.ndarray, independent: bool = False) -> np.ndarray:
     """How well corners tell a camera's pose beside a board, by what separates them from where they should be seen.
 
     Args:
         camera: What saw them.
         corners: Where.
         board: The board's pose in the camera's frame, (4, 4).
+        independent: Take their errors for independent, which in photographs they are not.
 
     Returns:
         (6, 6): a rotation (radians) and a shift (metres) in the camera's own frame.
     """
     residual, jacobian = linearize(camera, corners, board)
     by_pose = jacobian[:, -6:]
-    return np.linalg.inv(by_pose.T @ by_pose) * (residual @ residual) / (len(residual) - 6)
+    if independent:
+        return np.linalg.inv(by_pose.T @ by_pose) * (residual @ residual) / (len(residual) - 6)
+    by_corners = np.linalg.pinv(by_pose)
+    return by_corners @ corner_covariance(corners.points, residual, by_pose) @ by_corners.T
 
 
 def placement_covariance(placement_std: tuple[float, float], board: np.ndarray) -> np.ndarray:

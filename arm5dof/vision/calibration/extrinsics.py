@@ -15,6 +15,7 @@ from arm5dof.vision.calibration.covariance import add_pose, placement_covariance
 from arm5dof.vision.calibration.hand_eye import HandEye
 from arm5dof.vision.calibration.views import board_error, board_pose, image_names, read_gray
 from arm5dof.vision.camera import Camera
+from arm5dof.vision.images import ImageError, check_some_usable
 
 MAX_ERROR = 2.0
 """Root mean square error of a board's corners, pixels, above which another camera took the photograph."""
@@ -44,7 +45,6 @@ def from_board(
         BoardNotFoundError: The photograph shows another board, or none.
         UserError: The board is not seen whole, leaves its own pose open, or does not fit the camera's intrinsics; or
             the photograph cannot be read.
-        OSError: It cannot be read.
     """
     corners = find(camera, path, board)
     if corners is None:
@@ -76,7 +76,9 @@ class HandEyeCalibration:
     used: list[str]
     """The photographs from which that comes."""
     without: list[str]
-    """Those that do not."""
+    """Those that do not show the board."""
+    unread: dict[str, str]
+    """What is wrong with the files that cannot be read as photographs, by name."""
     outliers: dict[str, tuple[float, float]]
     """Those that show it but do not go with the hand's pose: by how many degrees and metres."""
 
@@ -114,17 +116,22 @@ def from_hand(
 
     Raises:
         UserError: The photographs do not determine the pose, contradict each other or the mount, do not fit the
-            camera's intrinsics, or cannot be read.
-        OSError: They cannot be read.
+            camera's intrinsics, or none can be read.
     """
     seen: dict[str, tuple[np.ndarray, Corners]] = {}
+    unread: dict[str, str] = {}
     names = image_names(paths)
     for i, (hand, path, name) in enumerate(zip(hands, paths, names, strict=True)):
-        corners = find(camera, path, board)
-        if corners is not None:
-            seen[name] = hand, corners
+        try:
+            corners = find(camera, path, board)
+        except ImageError as error:
+            unread[name] = str(error)
+        else:
+            if corners is not None:
+                seen[name] = hand, corners
         if progress is not None:
             progress(i + 1, name)
+    check_some_usable(unread.values(), len(paths))
     shown = list(seen)
 
     def at(chosen: Sequence[str], camera: Camera) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -145,7 +152,8 @@ def from_hand(
         eye_in_hand,
         result,
         used,
-        [name for name in names if name not in seen],
+        [name for name in names if name not in seen and name not in unread],
+        unread,
         outliers,
     )
 
@@ -155,7 +163,8 @@ def board_spread(camera: Camera, corners: Corners, board: np.ndarray) -> np.ndar
     shift along them."""
     carry, (x, y, z) = np.eye(6), board[:3, 3]
     carry[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]  # The camera's turn by w moves the board's origin p by p x w.
-    return carry @ pose_covariance(camera, corners, board) @ carry.T
+    # Hand-eye calibration finds out by what factor that is too small.
+    return carry @ pose_covariance(camera, corners, board, independent=True) @ carry.T
 
 
 def find(camera: Camera, path: Path, board: Board) -> Corners | None:
@@ -170,8 +179,8 @@ def find(camera: Camera, path: Path, board: Board) -> Corners | None:
         Its corners; None if it is not seen.
 
     Raises:
-        UserError: The board leaves its own pose open, or the photograph is not of this camera or cannot be read.
-        OSError: It cannot be read.
+        ImageError: The photograph cannot be read.
+        UserError: The board leaves its own pose open, or the photograph is not of this camera.
     """
     gray = read_gray(path)
     if board.is_ambiguous:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +16,7 @@ from arm5dof.vision import images
 from arm5dof.vision.calibration.boards import Board, Corners
 from arm5dof.vision.calibration.poses import pose_matrix
 from arm5dof.vision.camera import Camera
+from arm5dof.vision.images import ImageError
 
 SAME_PHOTOGRAPH = 0.5
 """Views whose corners are closer than so many pixels, on average, are one photograph twice, encoded anew perhaps, or
@@ -43,7 +45,9 @@ class BoardViews(NamedTuple):
     without: list[str]
     """Names of the photographs in which the board was not found."""
     size: tuple[int, int]
-    """Width and height of every photograph, pixels."""
+    """Width and height of every photograph that shows the board, pixels."""
+    unread: Mapping[str, str] = MappingProxyType({})
+    """What is wrong with the files that cannot be read as photographs, by name."""
 
 
 def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str], object] | None = None) -> BoardViews:
@@ -59,31 +63,36 @@ def find_views(paths: Sequence[Path], board: Board, progress: Callable[[int, str
 
     Raises:
         BoardNotFoundError: They show another board, or none.
-        UserError: They cannot be read, differ in size, or too few show the board.
-        OSError: They cannot be read.
+        UserError: None can be read, those that show the board differ in size, or are too few.
     """
     sizes: dict[str, tuple[int, int]] = {}
+    unread: dict[str, str] = {}
     found, without, notes = [], [], []
     for i, (path, name) in enumerate(zip(paths, image_names(paths), strict=True)):
-        gray = read_gray(path)
-        sizes[name] = gray.shape[1], gray.shape[0]
-        corners = board.find(gray)
-        notes.append(board.inspect(gray, corners))
-        if corners is None:
-            without.append(name)
+        try:
+            gray = read_gray(path)
+        except ImageError as error:
+            unread[name] = str(error)
         else:
-            found.append(BoardView(name, corners))
+            corners = board.find(gray)
+            notes.append(board.inspect(gray, corners))
+            if corners is None:
+                without.append(name)
+            else:
+                found.append(BoardView(name, corners))
+                sizes[name] = gray.shape[1], gray.shape[0]
         if progress is not None:
             progress(i + 1, name)
-    size = _one_size(sizes)
+    images.check_some_usable(unread.values(), len(paths))
     summary = f"{len(found)} of {len(paths)} photographs show the {board}"
+    summary += f", {len(unread)} cannot be read ({', '.join(unread)})" if unread else ""
     board.check_inspected(notes, summary)
     if len(found) < MIN_VIEWS:
         hint = "; in the others it is not seen whole, with a white margin and in focus" if without else ""
         raise UserError(
             f"{summary} and a calibration takes {MIN_VIEWS}, from different sides, tilted, near and far{hint}"
         )
-    return BoardViews(found, without, size)
+    return BoardViews(found, without, _one_size(sizes), unread)
 
 
 def distinct(views: Sequence[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
@@ -175,8 +184,5 @@ def image_names(paths: Sequence[Path]) -> list[str]:
 
 def read_gray(path: Path) -> np.ndarray:
     """A photograph in gray as the sensor saw it, whatever its EXIF orientation tag says, (h, w), uint8. Raises
-    `UserError` if it is none."""
-    gray = images.decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if gray is None:
-        raise UserError(f"{path} is {'no image that can be read' if path.stat().st_size else 'empty'}: leave it out")
-    return gray
+    `ImageError` if it is none."""
+    return images.decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)

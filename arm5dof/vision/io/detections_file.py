@@ -21,15 +21,19 @@ class DetectedFrame(NamedTuple):
     """None if the file does not tell."""
     size: tuple[int, int] | None
     """Width and height, pixels; None if the file does not tell."""
+    turned: bool | None
+    """Whether it was turned as its EXIF orientation tag says; None if the file does not tell."""
     detections: Detections
 
 
 def as_json(frame: Frame, detections: Detections) -> dict[str, Any]:
     """What was found in one frame, for JSON: `name`; `time_s`, seconds since the beginning or None for a photograph;
-    `image_size`, width and height; and `detections`, as `Detections.rows` has them."""
+    `image_size`, width and height; `turned`, whether that is so by an EXIF orientation tag; and `detections`, as
+    `Detections.rows` has them."""
     height, width = frame.image.shape[:2]
     time = None if frame.time is None else round(frame.time, 4)
-    return {"name": frame.name, "time_s": time, "image_size": [width, height], "detections": detections.rows()}
+    known = {"name": frame.name, "time_s": time, "image_size": [width, height], "turned": frame.turned}
+    return {**known, "detections": detections.rows()}
 
 
 def read(path: Path) -> list[DetectedFrame]:
@@ -50,14 +54,17 @@ def read(path: Path) -> list[DetectedFrame]:
             raise TypeError
         if content and all("detections" in entry for entry in content):
             return [_frame(entry) for entry in content]
-        return [DetectedFrame(None, None, _detections(content))]
+        return [DetectedFrame(None, None, None, _detections(content))]
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         raise UserError(f"{path} holds no detections: give the JSON that arm5dof vision detect writes") from None
 
 
 def _frame(entry: dict[str, Any]) -> DetectedFrame:
     width, height = entry["image_size"]
-    return DetectedFrame(str(entry["name"]), (int(width), int(height)), _detections(entry["detections"]))
+    turned = entry.get("turned")
+    if turned not in (True, False, None):
+        raise TypeError
+    return DetectedFrame(str(entry["name"]), (int(width), int(height)), turned, _detections(entry["detections"]))
 
 
 def _detections(rows: list[dict[str, Any]]) -> Detections:

@@ -7,7 +7,7 @@ import math
 import re
 import time
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -52,6 +52,8 @@ class Source:
     """A camera: its frames come when they come, and it goes on until somebody stops it."""
     has_cameras: bool = False
     """Random scenes: each frame brings its camera, known exactly."""
+    unread: list[str] = field(default_factory=list)
+    """What is wrong with each photograph that was left out, among those that frames were taken from so far."""
 
 
 def open_source(given: Sequence[str], upright: bool = True) -> Source:
@@ -109,9 +111,21 @@ def image_files(given: Sequence[Path]) -> list[Path]:
 
 
 def photographs(paths: Sequence[Path], upright: bool = True) -> Source:
-    """Image files, one after another, turned as their EXIF orientation tags say if they are to be
-    `upright`. The frames raise `UserError` at one that is no image."""
-    return Source((Frame(str(path), images.read(path, upright)) for path in paths), len(paths))
+    """Image files, one after another, turned as their EXIF orientation tags say if they are to be `upright`. One that
+    is no image is left out and noted in `Source.unread`; the frames raise `UserError` if all are."""
+    unread: list[str] = []
+
+    def frames() -> Frames:
+        for path in paths:
+            try:
+                image = images.read(path, upright)
+            except images.ImageError as error:
+                unread.append(str(error))
+            else:
+                yield Frame(str(path), image, turned=upright and images.has_orientation(path))
+        images.check_some_usable(unread, len(paths))
+
+    return Source(frames(), len(paths), unread=unread)
 
 
 def video(path: Path) -> Source:
@@ -184,12 +198,12 @@ def read_depth(path: Path) -> np.ndarray:
         (h, w) float64, metres; zero where the depth is missing.
 
     Raises:
-        UserError: It is no such image.
-        OSError: It cannot be read.
+        ImageError: It cannot be read, is damaged, has more pixels than OpenCV reads, or is no such image.
     """
-    pixels = images.decode(path, cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
-        raise UserError(f"{path} is no depth image: give a PNG file with one channel of 16 bits, in millimetres")
+    wanted = "a PNG file with one channel of 16 bits, in millimetres"
+    pixels = images.decode(path, cv2.IMREAD_UNCHANGED, wanted)
+    if pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise images.ImageError(f"{path} is no depth image: give {wanted}")
     return pixels / 1000
 
 

@@ -28,7 +28,16 @@ def test_the_command_writes_a_camera_and_tells_how_well_it_is_known(photographs,
 
     assert command(*photographs, *words[1:5], "--out", tmp_path / "again.yml", "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    assert list(found) == ["image_size", "rms_px", "intrinsics", "errors_px", "outliers_px", "copies", "without_board"]
+    assert list(found) == [
+        "image_size",
+        "rms_px",
+        "intrinsics",
+        "errors_px",
+        "outliers_px",
+        "copies",
+        "without_board",
+        "unread",
+    ]
     assert found["intrinsics"]["fx"]["value"] == pytest.approx(camera.matrix[0, 0], abs=1e-3)
     assert len(found["errors_px"]) == 13 and found["image_size"] == [640, 480]
 
@@ -39,6 +48,21 @@ def test_copies_of_photographs_are_named(photographs, tmp_path, capsys):
     assert command(*photographs[:8], tmp_path / "copy.jpg", *words) == 0
     said = capsys.readouterr().out
     assert f"copy.jpg    -      left out: the same as {photographs[2].name}" in said and "8 photographs of" in said
+
+
+def test_a_file_that_is_no_photograph_is_left_out(photographs, tmp_path, capfd):
+    (tmp_path / "words.jpg").write_text("hello")
+    words = [*photographs[:8], "--board", "9x6", "--square", 0.025]
+    assert command(tmp_path / "words.jpg", *words, "--out", tmp_path / "camera.yml") == 0
+    said = capfd.readouterr()
+    assert (
+        said.err.startswith(f"arm5dof: left out: {tmp_path / 'words.jpg'} is empty, damaged")
+        and said.err.count("\n") == 1
+    )
+    assert "words.jpg   -      left out: cannot be read" in said.out and "8 photographs of" in said.out
+    assert command(*words, "--out", tmp_path / "without.yml") == 0
+    one, other = (Camera.load(tmp_path / f"{name}.yml") for name in ("camera", "without"))
+    assert abs(one.matrix - other.matrix).max() < 1e-3
 
 
 def test_the_command_refuses_bad_input_in_one_line(photographs, tmp_path, capfd):
@@ -52,7 +76,7 @@ def test_the_command_refuses_bad_input_in_one_line(photographs, tmp_path, capfd)
         ([tmp_path / "absent"], {}, "no image and no folder"),
         ([tmp_path / "none"], {}, "holds no images"),
         ([tmp_path / "empty.jpg"], {}, "empty.jpg is empty"),
-        ([*photographs, tmp_path / "words.jpg"], {}, "words.jpg is no image"),
+        ([tmp_path / "empty.jpg", tmp_path / "words.jpg"], {}, "and none of the 1 others can be used"),
         (photographs[:1], {}, "1 of 1 photographs show the 9x6 checkerboard and a calibration takes 5"),
         (photographs[:1] * 9, {}, "1 of 1 photographs"),
         (photographs[:6], {"--board": "8x6"}, "show one of 9x6 inner corners: give --board 9x6"),

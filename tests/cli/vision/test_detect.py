@@ -9,11 +9,13 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from helpers.onnx_bytes import NAMES, SIZE, constant, output
+from helpers.photographs import vast_png
 from helpers.videos import RATE, greys, read_video, write_video
 
 from arm5dof.cli import main as cli
@@ -283,15 +285,48 @@ def test_bad_input_is_one_line(photos, clip, model, tmp_path, capfd):
     assert command("simulated:0") == 2 and "ask for one or more" in capfd.readouterr().err
 
 
-def test_what_came_before_a_damaged_image_is_kept(photos, model, tmp_path, capfd):
-    whole = (photos / "c.PNG").read_bytes()
-    (photos / "c.PNG").write_bytes(whole[: len(whole) // 2])
+@pytest.mark.parametrize("damaged", [["a.jpg"], ["b.png"], ["c.PNG"], ["a.jpg", "c.PNG"], ["b.png", "c.PNG"]])
+def test_damaged_images_are_named_and_left_out(damaged, photos, model, tmp_path, capfd):
+    for name in damaged:
+        whole = (photos / name).read_bytes()
+        (photos / name).write_bytes(whole[: len(whole) // 2])
+    assert command(photos, "--detector", model, "--out", tmp_path / "found", "--json") == 1
+    said = capfd.readouterr()
+    *each, last = said.err.splitlines()
+    assert [line.partition(" is empty, damaged")[0] for line in each] == [f"arm5dof: {photos / n}" for n in damaged]
+    assert last == f"arm5dof: {len(damaged)} of 3 files left out, for the reasons above"
+    good = [name for name in ("a.jpg", "b.png", "c.PNG") if name not in damaged]
+    assert {p.name for p in (tmp_path / "found").iterdir()} == {*good, "detections.json"}
+    frames = json.loads((tmp_path / "found" / "detections.json").read_text())
+    assert frames == json.loads(said.out) and [frame["name"] for frame in frames] == [str(photos / n) for n in good]
+
+
+def test_no_image_left_is_one_line(photos, model, tmp_path, capfd):
+    for path in photos.iterdir():
+        path.write_text("hello")
     assert command(photos, "--detector", model, "--out", tmp_path / "found") == 2
     err = capfd.readouterr().err
-    assert "c.PNG is empty, damaged" in err and f"2 frames before that in {tmp_path / 'found'}" in err
-    assert err.count("\n") == 1
-    assert {p.name for p in (tmp_path / "found").iterdir()} == {"a.jpg", "b.png", "detections.json"}
-    assert len(json.loads((tmp_path / "found" / "detections.json").read_text())) == 2
+    assert "a.jpg is empty, damaged" in err and "; and none of the 2 others can be used" in err and err.count("\n") == 1
+    assert set(tmp_path.iterdir()) == {photos}
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="a file that root too cannot read")
+def test_a_file_that_cannot_be_read_is_left_out(photos, model, capfd):
+    (photos / "a.jpg").unlink()
+    (photos / "a.jpg").symlink_to("/proc/self/mem")
+    assert command(photos, "--detector", model) == 1
+    assert "a.jpg cannot be read: Input/output error" in capfd.readouterr().err
+
+
+def test_specks_and_strips_are_images_like_others(tmp_path, capfd):
+    """By the detector that ships; beyond what OpenCV reads they are left out."""
+    for name, shape in {"speck": (1, 1), "wide": (1, 3000), "tall": (3000, 2)}.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full(shape, 90, np.uint8))
+    (tmp_path / "vast.png").write_bytes(vast_png())
+    assert command(tmp_path, "--json") == 1
+    said = capfd.readouterr()
+    assert said.err.count("\n") == 2 and "vast.png is empty, damaged, or no image that OpenCV reads" in said.err
+    assert [frame["image_size"] for frame in json.loads(said.out)] == [[1, 1], [2, 3000], [3000, 1]]
 
 
 def test_a_video_that_breaks_off_is_kept_up_to_there(cut, model, tmp_path, capfd):

@@ -61,6 +61,19 @@ def test_a_wrong_pose_is_named_and_left_out(shots, tmp_path, capsys):
     np.testing.assert_allclose(Camera.load(tmp_path / "out.yml", np.eye(4)).position, CAMERA[:3, 3], atol=2e-3)
 
 
+def test_a_file_that_is_no_photograph_is_named_and_left_out(shots, tmp_path, capfd):
+    paths, seen = shots
+    (paths[0].parent / "words.png").write_text("hello")
+    names = ["words.png" if i == 3 else path.name for i, path in enumerate(paths)]
+    table = write_poses(paths[0].parent / "unread.csv", hand_poses(seen, True), names)
+    KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")
+    words = ["hand-eye", tmp_path / "camera.yml", table, "--eye-in-hand", "--board", "8x5", "--square", "0.03"]
+    assert command(*words, "--out", tmp_path / "out.yml") == 0
+    said = capfd.readouterr()
+    assert "9 photographs" in said.out and "words.png: left out: cannot be read" in said.out
+    assert "words.png is empty, damaged, or no image" in said.err and said.err.count("\n") == 1
+
+
 def test_bad_input_is_one_line(shots, tmp_path, capfd):
     paths, seen = shots
     KNOWN.replace(has_extrinsics=False).save(tmp_path / "camera.yml")

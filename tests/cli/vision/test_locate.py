@@ -201,7 +201,7 @@ def test_bad_input_is_one_line(folder, tmp_path, capfd):
         ({"reach": [0.3, 0.1]}, "--reach takes the smallest distance and the largest"),
         ({"hand": [0, 0, 0, 1, 0, 0, 0]}, "has no hand_rotation"),
         ({"hand": [0, 0, 0, 0, 0, 0, 0]}, "has length 1, not 0"),
-        ({"depth": folder / "list.json"}, "is no depth image"),
+        ({"depth": folder / "list.json"}, "give a PNG file with one channel of 16 bits"),
         ({"depth-error": -1}, "--depth-error takes metres"),
         ({"camera": [folder / "posed.yml", "--camera", folder / "posed.yml"]}, "give one DETECTIONS.json and its"),
         ({"hight": 3}, "unexpected argument '--hight'"),

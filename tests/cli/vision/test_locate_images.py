@@ -212,11 +212,17 @@ def test_bad_input_is_one_line(photo, small, tmp_path, capfd):
         assert captured.err.count("\n") == 1 and not captured.out and sorted(tmp_path.rglob("*")) == before
 
 
-def test_an_image_of_another_size_leaves_those_before(photo, tmp_path, capfd):
-    other = tmp_path / "other.png"
-    cv2.imwrite(str(other), np.zeros((240, 320), np.uint8))
-    words = ["--camera", photo.with_name("posed.yml"), "--out", tmp_path / "placed"]
-    assert command(photo, other, *words) == 2
-    assert "other.png has 320x240 pixels and the camera 640x480; 1 frame before that in" in capfd.readouterr().err
+def test_images_that_are_damaged_or_of_another_size_are_left_out(photo, tmp_path, capfd):
+    other, words = tmp_path / "other.png", tmp_path / "words.png"
+    cv2.imwrite(str(other), np.zeros((1, 320), np.uint8))
+    words.write_text("hello")
+    options = ["--camera", photo.with_name("posed.yml"), "--out", tmp_path / "placed"]
+    assert command(other, photo, words, *options) == 1
+    first, second, last = capfd.readouterr().err.splitlines()
+    assert first == f"arm5dof: {other} has 320x1 pixels and the camera 640x480"
+    assert second.startswith(f"arm5dof: {words} is empty, damaged") and "2 of 3 files left out" in last
     assert {p.name for p in (tmp_path / "placed").iterdir()} == {"scene.png", "positions.json"}
     assert len(json.loads((tmp_path / "placed" / "positions.json").read_text())) == 1
+    assert command(other, words, *options[:2]) == 2
+    err = capfd.readouterr().err
+    assert "has 320x1 pixels" in err and "; and none of the 1 others can be used" in err and err.count("\n") == 1

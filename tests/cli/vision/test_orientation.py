@@ -1,5 +1,7 @@
 """EXIF orientation tags: a camera model belongs to the sensor's pixels, so they turn nothing where one is used."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -17,6 +19,7 @@ def command(*words):
     return cli.main(["vision", *map(str, words)])
 
 
+BOX = {"class_name": "cube", "class_id": 0, "confidence": 0.9, "xyxy": [30, 20, 36, 26]}
 BOARD = ["--board", "9x6", "--square", "0.02"]
 
 
@@ -48,9 +51,30 @@ def test_detections_in_a_turned_photograph_are_not_located(tmp_path, capfd):
     matrix = np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1.0]])
     Camera(matrix, np.zeros(5), np.diag([1.0, -1, -1]), np.array([0, 0, 0.5]), 64, 48).save(camera)
     found = tmp_path / "found.json"
-    found.write_text(
-        f'[{{"name": "{path}", "time_s": null, "image_size": [64, 48], "detections": [{{"class_name": "cube", '
-        '"class_id": 0, "confidence": 0.9, "xyxy": [30, 20, 36, 26]}]}]'
-    )
-    assert command("locate", found, "--camera", camera, "--height", "cube=0.015") == 2
-    assert "a.jpg has an orientation tag, by which it was turned" in capfd.readouterr().err
+    for turned, status in ((None, 2), (True, 2), (False, 0)):
+        entry = {"name": str(path), "time_s": None, "image_size": [64, 48], "turned": turned, "detections": [BOX]}
+        if turned is None:  # As files were before it was noted.
+            del entry["turned"]
+        found.write_text(json.dumps([entry]))
+        assert command("locate", found, "--camera", camera, "--height", "cube=0.015") == status
+        said = "a.jpg has an orientation tag, by which it was turned" in capfd.readouterr().err
+        assert said == bool(status)
+
+
+def test_detections_say_which_photographs_were_turned(tmp_path, capfd):
+    """Mirrored, so that its size tells nothing; and gone when it is to be located in."""
+    exif = Image.Exif()
+    exif[0x0112] = 2
+    pixels, camera = np.zeros((48, 64, 3), np.uint8), tmp_path / "c.yml"
+    Image.fromarray(pixels).save(tmp_path / "mirrored.jpg", exif=exif)
+    Image.fromarray(pixels).save(tmp_path / "plain.jpg")
+    matrix = np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1.0]])
+    Camera(matrix, np.zeros(5), np.diag([1.0, -1, -1]), np.array([0, 0, 0.5]), 64, 48).save(camera)
+    for name, turned in (("mirrored", True), ("plain", False)):
+        path, out = tmp_path / f"{name}.jpg", tmp_path / name
+        assert command("detect", path, "--out", out) == 0
+        (frame,) = json.loads((out / "detections.json").read_text())
+        assert frame["turned"] is turned
+        path.unlink()
+        assert command("locate", out / "detections.json", "--camera", camera) == (2 if turned else 0)
+        assert ("mirrored.jpg has an orientation tag" in capfd.readouterr().err) == turned

@@ -1,11 +1,9 @@
 """Photographs in which the board is looked for: OpenCV's, and ones that will not do."""
 
-import struct
-import zlib
-
 import cv2
 import numpy as np
 import pytest
+from helpers.photographs import vast_png
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration.boards import BoardNotFoundError, Checkerboard
@@ -31,18 +29,27 @@ def test_photographs_of_different_sizes_are_named(photographs, tmp_path):
     small = tmp_path / "small.png"
     cv2.imwrite(str(small), cv2.resize(cv2.imread(str(photographs[0])), (320, 240)))
     with pytest.raises(UserError, match=r"most have 640x480 pixels, but not small.png \(320x240\)"):
-        find_views([*photographs[:3], small], BOARD)
+        find_views([*photographs[:5], small], BOARD)
 
 
-def test_files_that_are_no_photographs_are_named(photographs, tmp_path):
-    for name, content, said in [
-        ("empty.png", b"", "is empty"),
-        ("words.jpg", b"hello", "no image"),
-        ("half.jpg", photographs[0].read_bytes()[:200], "no image"),
-    ]:
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(UserError, match=f"{name} .*{said}"):
-            find_views([photographs[0], tmp_path / name], BOARD)
+def test_files_that_are_no_photographs_are_named_and_left_out(photographs, tmp_path):
+    bad = []
+    for name, content in [("empty.png", b""), ("words.jpg", b"hello"), ("half.jpg", photographs[0].read_bytes()[:200])]:
+        bad.append(tmp_path / name)
+        bad[-1].write_bytes(content)
+    speck = tmp_path / "speck.png"
+    cv2.imwrite(str(speck), np.zeros((1, 1), np.uint8))
+    views = find_views([bad[0], *photographs[:5], *bad[1:], speck], BOARD)
+    assert [view.name for view in views.found] == [path.name for path in photographs[:5]]
+    assert views.without == ["speck.png"] and views.size == (640, 480), "it shows no board, whatever its size"
+    assert list(views.unread) == [path.name for path in bad]
+    assert all(f"{path} is empty, damaged, or no image" in views.unread[path.name] for path in bad)
+    with pytest.raises(
+        UserError, match=r"1 of 4 photographs show .*, 3 cannot be read \(empty.png, words.jpg, half.jpg\)"
+    ):
+        find_views([photographs[0], *bad], BOARD)
+    with pytest.raises(UserError, match=r"empty.png is empty, .*; and none of the 2 others can be used"):
+        find_views(bad, BOARD)
 
 
 def test_images_without_a_board(tmp_path):
@@ -55,13 +62,6 @@ def test_images_without_a_board(tmp_path):
 
 
 def test_an_image_beyond_opencvs_limit_is_refused(tmp_path):
-    """A PNG file whose header tells of 40000 x 40000 pixels."""
-
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = struct.pack(">IIBBBBB", 40000, 40000, 8, 0, 0, 0, 0)
-    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b"")
-    (tmp_path / "huge.png").write_bytes(b"\x89PNG\r\n\x1a\n" + parts)
-    with pytest.raises(UserError, match=r"huge\.png is no image that can be read: leave it out"):
+    (tmp_path / "huge.png").write_bytes(vast_png())
+    with pytest.raises(UserError, match=r"huge\.png is empty, damaged, or no image that OpenCV reads"):
         read_gray(tmp_path / "huge.png")
