@@ -298,6 +298,10 @@ def episode_returns(env: Task, act: Act, key: jax.Array, n: int) -> jax.Array:
     return total
 
 
+LARGEST = 1e18
+"""What people state, at most: in 32 bits squares of more are infinite."""
+
+
 def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
     """What people state, rows of finite numbers (n, k) or one (k,), as rows. Raises `UserError` for anything else."""
     shape = f"{len(components)} numbers ({', '.join(components)}), or rows of them"
@@ -311,4 +315,6 @@ def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
     for i, row in enumerate(rows, 1):
         if not np.isfinite(row).all():
             raise UserError(f"{name} {i} is not finite: {' '.join(map(str, row.tolist()))}")
+        if np.abs(row).max() > LARGEST:
+            raise UserError(f"{name} {i} is too large to compute with: {' '.join(map(str, row.tolist()))}")
     return rows

@@ -220,6 +220,8 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
         ("words.csv", "x,y,z\n0,0,there\n", "line 2"),
         ("short.csv", "x,y,z\n0,0\n", "line 2"),
         ("nan.csv", "x,y,z\n0.1,0.1,nan\n", "not finite"),
+        ("large.csv", "x,y,z\n0.1,0.1,1e308\n", "too large"),
+        ("long.csv", "x,y,z\n0,1,0.1,0.1\n", "line 2: more values than columns"),
     ]:
         (tmp_path / name).write_text(text)
         assert expected in fails("solve", trained, "--csv", tmp_path / name)
