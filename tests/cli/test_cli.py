@@ -488,6 +488,9 @@ def test_failures_that_nobody_waits_for_are_silent(caplog, capfd):
         asyncio.run(give_up())
         raise OSError("File too large")
     assert not caplog.records and not capfd.readouterr().err
+    told = pytest.raises(UserError, match=r"cannot write \(No space left on device\)")
+    with told, checkpoint._as_user_error("cannot write"):
+        raise ValueError(f"Failed to write 7738 bytes [os_error_code='28']; {'metadata ' * 99}")
 
 
 def test_a_run_may_be_called_like_a_number(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from arm5dof.ddpg import DDPGConfig
 from arm5dof.envs.reach import ReachConfig
 from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 from arm5dof.training import config
 
 
@@ -119,6 +120,9 @@ def test_missing_and_broken_files(tmp_path):
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match="not valid TOML"):
         config.load_config(tmp_path / "binary.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(UserError, match=r"folder\.toml cannot be read: Is a directory"):
+        files.read_toml(tmp_path / "folder.toml")
 
 
 def test_what_a_file_leaves_open_is_as_in_its_tasks_file(tmp_path):
