@@ -10,22 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from damage import (
-    NUMBERS,
-    WORDS,
-    Rng,
-    damaged_array,
-    damaged_bytes,
-    damaged_csv,
-    damaged_json,
-    damaged_message,
-    damaged_png,
-    damaged_text,
-    damaged_toml,
-    damaged_xml,
-    damaged_zip,
-    pick,
-)
+from damage import damaged_csv, damaged_json, damaged_text, damaged_toml, damaged_xml
+from damage_binary import damaged_array, damaged_bytes, damaged_message, damaged_png, damaged_zip
+from values import NUMBERS, WORDS, Rng, pick
 
 ROOT = Path(__file__).parents[2]
 TINY = {
