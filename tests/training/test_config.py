@@ -71,6 +71,8 @@ def test_any_valid_value_survives_text(lr, discount, batch, norm, activation):
         ({"ddpg": {"batch_size": 0}}, "greater than or equal to 1"),
         ({"ddpg": {"actor_depth": 3000}}, "less than or equal to 100"),
         ({"ddpg": {"noise": 10**400}}, "ddpg.noise"),
+        ({"ddpg": {"noise": [-(2**63)]}}, "ddpg.noise = (-9223372036854775808,): input should be a valid number"),
+        ({"ddpg": {"noise": {"low": 1}}}, "ddpg.noise = {'low': 1}: input should be a valid number"),
         ({"ddpg": {"discount": 1.5}}, "less than or equal to 1"),
         ({"ddpg": {"actor_lr": float("nan")}}, "finite"),
         ({"ddpg": {"layer_norm": 1}}, "boolean"),
