@@ -73,9 +73,8 @@ def run(args: argparse.Namespace, work: Path) -> None:
     """Try the sections that are asked for, and keep what was found."""
     only = dict(word.partition(":")[::2] for word in args.only) or dict.fromkeys(TITLES, "")
     for section, parts in only.items():
-        started = time.monotonic()
         found = _fuzz(args, parts, work) if section == "fuzz" else _cases(args, section, work)
-        found = ["", *found, "", f"Seed {args.seed}, {time.monotonic() - started:.0f} s on {_machine()}."]
+        found = ["", *found, "", f"Seed {args.seed}, {_machine()}."]
         print(f"## {TITLES[section]}", *found, sep="\n")
         if section != "fuzz" or (args.inputs >= INPUTS and not parts):
             _keep(TITLES[section], "\n".join(found))
@@ -110,11 +109,15 @@ def _fuzz(args: argparse.Namespace, parts: str, work: Path) -> list[str]:
                 bar.say(f"{outcome.reader}:{outcome.number} {outcome.kind}: {outcome.told[-900:]}")
             bar.update(i + 1, f"{faults} faults")
     outcomes = [known[task] for task in planned]
-    return [f"{len(outcomes)} inputs.", "", fuzz.table(outcomes)]
+    mended = {(o.reader, o.number) for o in before if o.kind in fuzz.FAULTS} & set(planned)
+    told = f"{len(outcomes)} inputs, {sum(o.seconds for o in outcomes):.0f} s of a processor"
+    told += f"; {len(mended)} were faults at first, and were read again" if mended else ""
+    return [f"{told}.", "", fuzz.table(outcomes)]
 
 
 def _cases(args: argparse.Namespace, section: str, work: Path) -> list[str]:
     cases: list[trainings.Case] = []
+    started = time.monotonic()
     with Bar(section, None, "cases") as bar:
         say: Callable[[int, int], None] = lambda done, total: setattr(bar, "total", total)
         for case in _section(args, section, work, say):
@@ -128,7 +131,14 @@ def _cases(args: argparse.Namespace, section: str, work: Path) -> list[str]:
         f"| {_cell(case.name, 60)} | {'yes' if case.good else '**NO**'} | {_cell(text, 300)} |"
         for case, text in zip(cases, told, strict=True)
     ]
-    return [f"{good} of {len(cases)} as they must be.", "", "| what | right | how |", "| --- | --- | --- |", *rows]
+    took = time.monotonic() - started
+    return [
+        f"{good} of {len(cases)} as they must be; {took:.0f} s.",
+        "",
+        "| what | right | how |",
+        "| --- | --- | --- |",
+        *rows,
+    ]
 
 
 def _section(
