@@ -72,7 +72,7 @@ def _validate(config: Any) -> None:
     given = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}  # TOML has no tuples.
     fixed = {f.name for f in dataclasses.fields(config) if f.metadata.get("static")}
-    plain = {name: v for name, v in values.items() if name in fixed or isinstance(v, (bool, int, float, str))}
+    plain = {name: v for name, v in values.items() if name in fixed or not _is_array(v)}
     try:
         checked = _validator(type(config))(**plain)  # type: ignore[arg-type]
     except pydantic.ValidationError as error:
@@ -81,6 +81,13 @@ def _validate(config: Any) -> None:
         raise UserError(f"{where} = {fault['input']!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}") from None
     for name in plain:
         object.__setattr__(config, name, getattr(checked, name))
+
+
+def _is_array(value: Any) -> bool:
+    """Whether it is an array or a traced number, or holds one."""
+    if isinstance(value, (bool, int, float, str)):  # NumPy's numbers are both.
+        return False
+    return any(hasattr(leaf, "dtype") for leaf in jax.tree.leaves(value))
 
 
 @functools.cache

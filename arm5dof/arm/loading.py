@@ -20,7 +20,7 @@ from arm5dof.arm.end_effector import find_end_effector
 from arm5dof.arm.refusals import couplings, unfit_joints
 from arm5dof.arm.workspace import moves
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
+from arm5dof.runtime import files, models
 
 FAR = 20.0
 """Metres from which an arm's reach speaks for a model in millimetres."""
@@ -135,9 +135,10 @@ def _compile(source: str | Path | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoc
         names = ", ".join(files.shipped("mjcf", ".xml"))
         raise UserError(f"no MJCF file {str(source)!r}: give a path, or one of those shipped: {names}")
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        if path.suffix.lower() == ".urdf":  # Links without a joint of their own are the frames that people name.
-            spec.compiler.fusestatic = False
-        return spec, spec.compile()
+        with models.reading():
+            spec = mujoco.MjSpec.from_file(str(path))
+            if path.suffix.lower() == ".urdf":  # Links without a joint of their own are the frames that people name.
+                spec.compiler.fusestatic = False
+            return spec, spec.compile()
     except ValueError as error:
-        raise UserError(f"MuJoCo cannot read {path}: {error}") from None
+        raise UserError(f"MuJoCo cannot read {path}: {' '.join(str(error).split())}") from None

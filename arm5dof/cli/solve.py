@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from arm5dof.envs.paths import Path as Line
     from arm5dof.training.policy import Policy
 
+REST = "\0"
+"""What no column of a CSV is called."""
+
 HELP = """\
 Ask a trained policy for joint angles.
 
@@ -126,7 +129,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
             "knows serves the whole line; divide it there, or give points that lie nearer to each other"
         )
     if not all(reached):
-        name = next(name for name in units if max(errors[name]) > tolerances[name])
+        name = next(name for name in units if not all(error <= tolerances[name] for error in errors[name]))
         worst = max(range(len(rows)), key=lambda i: errors[name][i])
         point = ", ".join(f"{v:g}" for v in next(iter(inputs.values()))[worst])
         limits = " and ".join(f"{tolerances[name]:g} {unit.unit}" for name, unit in units.items())
@@ -210,10 +213,12 @@ def _read_csv(path: Path, model: ForwardModel) -> Inputs:
     inputs: Inputs = {name: [] for name in model.goal_inputs}
     try:
         with open(path, newline="", encoding="utf-8-sig") as handle:
-            reader = csv.DictReader(handle)
+            reader = csv.DictReader(handle, restkey=REST)
             if not set(columns) <= set(reader.fieldnames or ()):
                 raise UserError(f"{path} needs a header with {wanted} (metres)")
             for row in reader:
+                if any(row.get(REST, ())):  # A decimal comma, or columns that have moved.
+                    raise UserError(f"{path}, line {reader.line_num}: more values than columns")
                 try:
                     for name, parts in model.goal_inputs.items():
                         inputs[name].append([float(row[part]) for part in parts])

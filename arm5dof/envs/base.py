@@ -298,6 +298,10 @@ def episode_returns(env: Task, act: Act, key: jax.Array, n: int) -> jax.Array:
     return total
 
 
+LARGEST = 1e18
+"""What people state, at most: in 32 bits squares of more are infinite."""
+
+
 def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
     """What people state, rows of finite numbers (n, k) or one (k,), as rows. Raises `UserError` for anything else."""
     shape = f"{len(components)} numbers ({', '.join(components)}), or rows of them"
@@ -308,8 +312,8 @@ def vectors(name: str, values: Any, components: tuple[str, ...]) -> np.ndarray:
     if array.ndim not in (1, 2) or array.shape[-1] != len(components) or not len(array):
         raise UserError(f"{name} takes {shape}, not an array of shape {array.shape}")
     rows = np.atleast_2d(array)
-    finite = np.isfinite(rows).all(1)
-    if not finite.all():
-        i = int(finite.argmin())
-        raise UserError(f"{name} {i + 1} is not finite: {' '.join(map(str, rows[i].tolist()))}")
+    for good, why in ((np.isfinite(rows), "is not finite"), (np.abs(rows) <= LARGEST, "is too large to compute with")):
+        if not good.all():
+            i = int(good.all(1).argmin())
+            raise UserError(f"{name} {i + 1} {why}: {' '.join(map(str, rows[i].tolist()))}")
     return rows

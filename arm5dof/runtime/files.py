@@ -64,7 +64,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file. Raises `UserError` if it is none."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, RecursionError) as error:
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not valid TOML: {error}") from None
 
 

@@ -12,6 +12,8 @@ import gc
 import hashlib
 import json
 import logging
+import os
+import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -244,6 +246,8 @@ def _as_user_error(message: str) -> Iterator[None]:
     except Exception as error:
         reason = (str(error) or type(error).__name__).strip().splitlines()[0].split(" [source")[0]
         reason = reason if len(reason) < 160 else "..." + reason[-160:]
+        if code := re.search(r"os_error_code='(\d+)'", str(error)):  # It is said after all of the array's metadata.
+            reason = os.strerror(int(code[1]))
         error.with_traceback(None)  # Its frames hold what is to be collected.
         gc.collect()
         raise UserError(f"{message} ({reason})") from error

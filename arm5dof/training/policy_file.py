@@ -13,7 +13,7 @@ import numpy as np
 
 from arm5dof.ddpg import Networks
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
+from arm5dof.runtime import files, models
 from arm5dof.training import config, robot
 from arm5dof.training.checkpoint import named, rebuild
 from arm5dof.training.policy import Policy
@@ -81,7 +81,8 @@ def load_policy(path: str | Path) -> Policy:
             if ":" in str(values["env"]["task"]):  # Nobody's code is run because a file says so.
                 raise ValueError("its task does not ship")
             settings = config.build(values)
-            spec = mujoco.MjSpec.from_zip(io.BytesIO(archive.read(ROBOT)))
+            with models.reading():
+                spec = mujoco.MjSpec.from_zip(io.BytesIO(archive.read(ROBOT)))
             with np.load(io.BytesIO(archive.read(NETWORKS)), allow_pickle=False) as arrays:
                 leaves = dict(arrays)
         made = Trainer(config.make_env(settings, spec.compile()), settings)

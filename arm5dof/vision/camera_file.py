@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -101,10 +102,16 @@ def _value(node: cv2.FileNode) -> Any:
         return node.string()
     if not node.isMap():
         return node.real()
-    if "dt" in node.keys():  # noqa: SIM118
-        return node.mat()
-    numbers = node.getNode("data")  # ROS leaves out of what type they are.
-    return np.array([numbers.at(i).real() for i in range(numbers.size())])
+    # FileNode.mat() writes beyond its memory where a matrix is not as large as it says, and ROS states no type for it.
+    numbers, sizes = _items(node.getNode("data")), _items(node.getNode("sizes"))
+    size = math.prod(n.real() for n in sizes or (node.getNode("rows"), node.getNode("cols")))
+    if size != len(numbers) or not all(n.isReal() or n.isInt() for n in numbers):
+        return None
+    return np.array([n.real() for n in numbers])
+
+
+def _items(node: cv2.FileNode) -> list[cv2.FileNode]:
+    return [node.at(i) for i in range(node.size())] if node.isSeq() else []
 
 
 def _lens(path: Path, values: dict[str, Any]) -> str:

@@ -6,40 +6,31 @@ and another takes its place. Every input follows from the seed, its reader and i
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import re
 import selectors
 import shutil
 import subprocess
 import sys
 import time
-import traceback
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import psutil
 import readers
 
 PATIENCE_S = 10.0
-"""Of a processor, for one input; twelve times that by the clock, for other processes are there too."""
-WARM_UP_S = 300.0
-"""For the first input that a worker gets: programs are compiled."""
+"""Of a processor, for one input: seconds by the clock say little where other processes run. What takes longer may only
+have compiled programs, so that it is read once more, and is a hang if it takes that long again."""
+LIMIT_S = 90.0
+"""Of a processor, programs and all; three times that by the clock, for what waits without end."""
 MEMORY = 4 * 2**30
 """Bytes from which a worker is exchanged for a new one, for programs stay in memory."""
 FAULTS = ("traceback", "hang", "died", "pickle", "lost", "litter", "unclear", "not JSON")
 """What must not be: an error's traceback; more than ten seconds; a process that dies; a pickle that is run; an input
 that is changed; an output that is left half; a refusal without its line, or with others; JSON that is none."""
-
-BAR = re.compile(r"[a-z][a-z :]*: \d+/\d+ ")
-"""A line of a progress bar."""
-FOREIGN = re.compile(r"WARN|libpng|JPEG|TIFF|Warning:|[Ee]rror\b")
-"""What is said by libraries that have not been asked."""
 
 
 class Outcome(NamedTuple):
@@ -50,6 +41,7 @@ class Outcome(NamedTuple):
     kind: str
     """`answered`, `refused`, or one of the faults."""
     seconds: float
+    """Of a processor."""
     told: str
     """What was said, or what is wrong."""
 
@@ -73,7 +65,7 @@ class Worker:
         self._ask, self.answers = ours[1], theirs[0]
         command = [
             sys.executable,
-            str(Path(__file__)),
+            str(Path(__file__).with_name("reading.py")),
             str(folder),
             str(sound),
             str(seed),
@@ -81,18 +73,23 @@ class Worker:
             str(theirs[1]),
         ]
         canary = str(folder.parent / readers.CANARY)
-        environment = {**os.environ, "PYTHONPATH": str(readers.ROOT), "FAULTS_CANARY": canary}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": str(readers.ROOT),
+            "FAULTS_CANARY": canary,
+            "PYTHONFAULTHANDLER": "1",
+        }
         self.process = subprocess.Popen(
             command, pass_fds=(ours[0], theirs[1]), stdin=subprocess.DEVNULL, env=environment, cwd=folder
         )
         os.close(ours[0])
         os.close(theirs[1])
         self.task: tuple[str, int] | None = None
-        self.fresh, self._text = True, b""
+        self._repeated, self._text = False, b""
 
-    def give(self, task: tuple[str, int]) -> None:
+    def give(self, task: tuple[str, int], repeated: bool = False) -> None:
         """Hand over an input."""
-        self.task, self._since, self._used = task, time.monotonic(), self._cpu()
+        self.task, self._repeated, self._since, self._used = task, repeated, time.monotonic(), self._cpu()
         os.write(self._ask, (json.dumps(task) + "\n").encode())
 
     def take(self) -> Outcome | None:
@@ -105,7 +102,12 @@ class Worker:
         if not self._text.endswith(b"\n"):
             return None
         outcome = Outcome(*self.task, *json.loads(self._text))
-        self._text, self.task, self.fresh = b"", None, False
+        self._text = b""
+        if outcome.seconds > PATIENCE_S:
+            if not self._repeated:
+                return self.give(self.task, repeated=True)
+            outcome = outcome._replace(kind="hang", told=f"{outcome.seconds:.0f} s of a processor, twice")
+        self.task = None
         return outcome
 
     def overdue(self) -> Outcome | None:
@@ -113,7 +115,7 @@ class Worker:
         if self.task is None:
             return None
         used, passed = self._cpu() - self._used, time.monotonic() - self._since
-        if max(used, passed / 12) < (WARM_UP_S if self.fresh else PATIENCE_S):
+        if max(used, passed / 3) < LIMIT_S:
             return None
         self.process.kill()
         return self._ended("hang", f"{used:.0f} s of a processor, {passed:.0f} s by the clock")
@@ -155,16 +157,16 @@ def prepare(work: Path) -> Path:
     return sound
 
 
-def campaign(inputs: int, only: Sequence[str], seed: int, workers: int, work: Path) -> Iterator[Outcome]:
-    """Read all inputs, and yield what came of each."""
+def campaign(tasks: Sequence[tuple[str, int]], seed: int, workers: int, work: Path) -> Iterator[Outcome]:
+    """Read inputs, and yield what came of each."""
     sound = prepare(work)
-    waiting = plan(inputs, only)[::-1]
+    waiting = list(tasks)[::-1]
     pool = [Worker(work / f"w{i}", seed, sound) for i in range(workers)]
     busy = 0
     while waiting or busy:
         for i, worker in enumerate(pool):
             if worker.task is None and waiting:
-                if not worker.fresh and worker.is_large:
+                if worker.is_large:
                     worker.close()
                     worker = pool[i] = Worker(worker.folder, seed, sound)
                 worker.give(waiting.pop())
@@ -189,12 +191,7 @@ def campaign(inputs: int, only: Sequence[str], seed: int, workers: int, work: Pa
 
 def again(reader: str, number: int, seed: int, work: Path) -> Outcome:
     """What comes of one input."""
-    worker = Worker(work / "w0", seed, prepare(work))
-    worker.give((reader, number))
-    outcome = None
-    while outcome is None:
-        outcome = worker.take()
-    worker.close()
+    [outcome] = campaign([(reader, number)], seed, 1, work)
     return outcome
 
 
@@ -213,111 +210,3 @@ def table(outcomes: Sequence[Outcome]) -> str:
     faults = [o for o in outcomes if o.kind in FAULTS]
     lines += ["", *(f"- {o.reader}:{o.number} {o.kind}: `{o.told[-300:]}`" for o in faults[:100])]
     return "\n".join(lines).strip()
-
-
-# The worker's side.
-
-
-def work(folder: Path, sound: Path, seed: int, asks: int, answers: int) -> None:
-    """Read inputs until nobody asks for more."""
-    from arm5dof.cli import main as cli
-
-    readers.shorten()
-    _keep_policies()
-    said = os.open(folder / "said", os.O_RDWR | os.O_CREAT | os.O_TRUNC)
-    os.dup2(said, 2)
-    out = os.open(folder / "printed", os.O_RDWR | os.O_CREAT | os.O_TRUNC)
-    os.dup2(out, 1)
-    for line in os.fdopen(asks):
-        reader, number = json.loads(line)
-        for file in (1, 2):
-            os.ftruncate(file, 0)
-            os.lseek(file, 0, os.SEEK_SET)
-        started = time.monotonic()
-        kind, told = _one(cli.main, folder, sound, seed, reader, number)
-        os.write(answers, (json.dumps([kind, time.monotonic() - started, told]) + "\n").encode())
-
-
-def _one(main: Any, folder: Path, sound: Path, seed: int, reader: str, number: int) -> tuple[str, str]:
-    how, rng = readers.READERS[reader], np.random.default_rng([seed, zlib.crc32(reader.encode()), number])
-    given, outputs = folder / "in", folder / "out"
-    for place in (given, outputs):
-        shutil.rmtree(place, ignore_errors=True)
-    outputs.mkdir()
-    shutil.copytree(readers.pick(rng, sorted((sound / reader).iterdir())), given)
-    if how.damaged:
-        readers.damage(rng, given, how.damaged, sound)
-    words = how.command(given, outputs / "out", rng)
-    before = _digests(given)
-    canary = folder.parent / readers.CANARY
-    (folder / "words").write_text(json.dumps(words))
-    status: Any = None
-    try:
-        status = main(words)
-    except readers.Began:
-        status = 0
-    except SystemExit as end:
-        status = end.code
-    except BaseException:
-        return "traceback", traceback.format_exc()[-1500:]
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    printed, said = ((folder / name).read_text(errors="replace") for name in ("printed", "said"))
-    if canary.exists():
-        canary.unlink()
-        return "pickle", said
-    if "Traceback" in said:
-        return "traceback", said[-1500:]
-    after = _digests(given)
-    if changed := [name for name in before if after.get(name) != before[name] and (how.kept or name not in after)]:
-        return "lost", f"{words}: {changed}"
-    if status == 2 and how.damaged and reader != "targets" and (left := [path.name for path in outputs.iterdir()]):
-        return "litter", f"{words}: {left}: {said}"
-    strange = [line for line in said.splitlines() if not line.startswith("arm5dof: ") and not BAR.match(line)]
-    strange = [line for line in strange if status == 2 or FOREIGN.search(line)]
-    if status not in (0, 1, 2) or strange or (status == 2 and "arm5dof: " not in said):
-        return "unclear", f"{words}: status {status}, said: {' / '.join(strange) or said}"
-    if status == 0 and "--json" in words and printed.strip() and "--help" not in words and "-h" not in words:
-        try:
-            json.loads(printed, parse_constant=_refuse)
-        except ValueError:
-            return "not JSON", printed[:500]
-    return ("refused" if status == 2 else "answered"), said[-300:]
-
-
-def _refuse(word: str) -> float:
-    raise ValueError(word)
-
-
-def _digests(folder: Path) -> dict[str, str]:
-    """What is in a folder's files, by name."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.name != ".lock":
-            found[str(path.relative_to(folder))] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
-
-
-def _keep_policies() -> None:
-    """A policy of a sound run is restored once, not for every file of targets."""
-    from arm5dof.training.run import Run
-
-    made: dict[str, Any] = {}
-    restore = Run.policy
-
-    def policy(run: Run) -> Any:
-        key = json.dumps(_digests(run.folder))
-        if key not in made:
-            found = restore(run)
-            if len(made) > 3:
-                return found
-            made[key] = found
-        return made[key]
-
-    Run.policy = policy  # type: ignore[method-assign]
-
-
-if __name__ == "__main__":
-    where, seeds, seed_text, asked, answered = sys.argv[1:]
-    work(Path(where), Path(seeds), int(seed_text), int(asked), int(answered))

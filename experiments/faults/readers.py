@@ -10,22 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from damage import (
-    NUMBERS,
-    WORDS,
-    Rng,
-    damaged_array,
-    damaged_bytes,
-    damaged_csv,
-    damaged_json,
-    damaged_message,
-    damaged_png,
-    damaged_text,
-    damaged_toml,
-    damaged_xml,
-    damaged_zip,
-    pick,
-)
+from damage import damaged_csv, damaged_json, damaged_text, damaged_toml, damaged_xml
+from damage_binary import damaged_array, damaged_bytes, damaged_message, damaged_png, damaged_zip
+from values import NUMBERS, WORDS, Rng, pick
 
 ROOT = Path(__file__).parents[2]
 TINY = {
@@ -187,6 +174,7 @@ def _on(*words: str) -> Callable[[Path, Path, Rng], list[str]]:
 
 BOARD = ("--board", "8x5", "--square", "0.03", "--out", "OUT.yml")
 LOCATE = ("vision", "locate", "@found.json", "--camera", "@camera.yml", "--json")
+SIZE = ("--size", "64")  # For which those networks are made.
 DETECT = ("vision", "detect", "@small.png", "--detector")
 
 
@@ -213,8 +201,8 @@ READERS = {
     ),
     "detections": Reader(800, _on(*LOCATE), "found.json"),
     "job": Reader(300, _on("grasp", "--task", "@job.toml", "--eyes", "truth"), "job.toml"),
-    "names": Reader(150, _on(*DETECT, "@nameless.onnx", "--names", "@names.txt"), "names.txt"),
-    "onnx": Reader(600, _on(*DETECT, "@net.onnx", "--json"), "net.onnx"),
+    "names": Reader(150, _on(*DETECT, "@nameless.onnx", *SIZE, "--names", "@names.txt"), "names.txt"),
+    "onnx": Reader(600, _on(*DETECT, "@net.onnx", *SIZE, "--json"), "net.onnx"),
     "pt": Reader(400, _on(*DETECT, "@net.pt"), "net.pt"),
     "weights": Reader(300, _on(*DETECT, "@net.npz"), "net.npz"),
     "policy": Reader(250, _on("grasp", "--policy", "@policy.zip", "--eyes", "truth"), "policy.zip"),

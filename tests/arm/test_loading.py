@@ -218,6 +218,15 @@ def test_urdf(tmp_path: Path):
     assert "couples 'j2' by <joint>" in said(lambda: load_arm(path))
 
 
+def test_a_model_with_nan_is_refused_and_mujoco_writes_no_log(tmp_path: Path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    for name, text in (("r.urdf", URDF.format(LINK.format("l1"), LINK.format("l2"), "")), ("r.xml", robot().to_xml())):
+        path = tmp_path / name
+        path.write_text(text.replace(" .1", " nan", 1).replace("0.1", "nan", 1))
+        assert said(lambda path=path: load_arm(path)) == f"MuJoCo cannot read {path}: a number in it is NaN"
+    assert capfd.readouterr().err == "" and {p.name for p in tmp_path.iterdir()} == {"r.urdf", "r.xml"}
+
+
 # What couples joints
 
 WELD = '<equality><weld body1="tip" body2="car"/></equality>'

@@ -220,6 +220,8 @@ def test_solve_refuses_bad_targets(trained, tmp_path, fails):
         ("words.csv", "x,y,z\n0,0,there\n", "line 2"),
         ("short.csv", "x,y,z\n0,0\n", "line 2"),
         ("nan.csv", "x,y,z\n0.1,0.1,nan\n", "not finite"),
+        ("large.csv", "x,y,z\n0.1,0.1,1e308\n", "too large"),
+        ("long.csv", "x,y,z\n0,1,0.1,0.1\n", "line 2: more values than columns"),
     ]:
         (tmp_path / name).write_text(text)
         assert expected in fails("solve", trained, "--csv", tmp_path / name)
@@ -486,6 +488,9 @@ def test_failures_that_nobody_waits_for_are_silent(caplog, capfd):
         asyncio.run(give_up())
         raise OSError("File too large")
     assert not caplog.records and not capfd.readouterr().err
+    told = pytest.raises(UserError, match=r"cannot write \(No space left on device\)")
+    with told, checkpoint._as_user_error("cannot write"):
+        raise ValueError(f"Failed to write 7738 bytes [os_error_code='28']; {'metadata ' * 99}")
 
 
 def test_a_run_may_be_called_like_a_number(tmp_path, monkeypatch):

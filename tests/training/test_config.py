@@ -12,6 +12,7 @@ from arm5dof.ddpg import DDPGConfig
 from arm5dof.envs.reach import ReachConfig
 from arm5dof.envs.reach_pose import ReachPoseConfig
 from arm5dof.errors import UserError
+from arm5dof.runtime import files
 from arm5dof.training import config
 
 
@@ -70,6 +71,8 @@ def test_any_valid_value_survives_text(lr, discount, batch, norm, activation):
         ({"ddpg": {"batch_size": 0}}, "greater than or equal to 1"),
         ({"ddpg": {"actor_depth": 3000}}, "less than or equal to 100"),
         ({"ddpg": {"noise": 10**400}}, "ddpg.noise"),
+        ({"ddpg": {"noise": [-(2**63)]}}, "ddpg.noise = (-9223372036854775808,): input should be a valid number"),
+        ({"ddpg": {"noise": {"low": 1}}}, "ddpg.noise = {'low': 1}: input should be a valid number"),
         ({"ddpg": {"discount": 1.5}}, "less than or equal to 1"),
         ({"ddpg": {"actor_lr": float("nan")}}, "finite"),
         ({"ddpg": {"layer_norm": 1}}, "boolean"),
@@ -119,6 +122,9 @@ def test_missing_and_broken_files(tmp_path):
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match="not valid TOML"):
         config.load_config(tmp_path / "binary.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(UserError, match=r"folder\.toml cannot be read: Is a directory"):
+        files.read_toml(tmp_path / "folder.toml")
 
 
 def test_what_a_file_leaves_open_is_as_in_its_tasks_file(tmp_path):

@@ -91,6 +91,7 @@ def test_solve_says_what_it_takes(policy: Policy):
     point = [0.1, 0.1, 0.1]
     assert said(lambda: policy.solve([0.1, float("nan"), 0.1])) == "target 1 is not finite: 0.1 nan 0.1"
     assert said(lambda: policy.solve([point, [0.1, 0, -np.inf]])) == "target 2 is not finite: 0.1 0.0 -inf"
+    assert said(lambda: policy.solve([point, [0, 0, 1e308]])) == "target 2 is too large to compute with: 0.0 0.0 1e+308"
     takes = "solve takes target (x, y, z) for this task, each once, not "
     assert said(lambda: policy.solve(taget=point)) == f"{takes}taget"
     assert said(lambda: policy.solve(point, approach=point)) == f"{takes}target, approach"

@@ -298,6 +298,10 @@ def test_files_that_are_no_cameras_are_one_line(tmp_path):
 
     write()
     assert (Camera.load(path).matrix == matrix).all()
+    whole = path.read_text()
+    for line, other in (("rows: 3", "rows: 2"), ("rows: 3", "# 3"), ("cols: 3", "cols: 4"), ("500., 0.", "500.")):
+        path.write_text(whole.replace(line, other, 1))  # OpenCV would write beyond its memory.
+        assert "has no camera_matrix of the right size" in said()
     for changes, expected in [
         ({"camera_matrix": None}, "no camera_matrix"),
         ({"camera_matrix": 3.0}, "no camera_matrix"),

@@ -182,8 +182,9 @@ rectification_matrix:
         (opencv + "model_type: KANNALA_BRANDT\n", "model_type KANNALA_BRANDT"),
         (ros.replace("equidistant", "fov"), "says distortion_model fov, which is no lens model that is known"),
         (ros + "fisheye_model: 0\n", "says fisheye_model 0 and distortion_model equidistant"),
-        (ros.replace("0.004, -0.001", "0.004, -0.001, 0"), "has 5 distortion_coefficients: give 4, those of"),
-        (ros.replace("data: [0.02", "dota: [0.02"), "has 0 distortion_coefficients"),
+        (ros.replace("4\n  data: [", "5\n  data: [0, "), "has 5 distortion_coefficients: give 4, those of"),
+        (ros.replace("data: [0.02", "data: [0, 0.02"), "has no distortion_coefficients of the right size"),
+        (ros.replace("data: [0.02", "dota: [0.02"), "has no distortion_coefficients of the right size"),
     ]:
         path.write_text(text)
         with pytest.raises(UserError, match=said) as caught:

@@ -23,6 +23,9 @@ MIN_TURN_DEG = 5.0
 """How far the hand must turn about a second axis, root mean square over all pairs of poses. Turning about parallel
 axes leaves the camera's place along them open."""
 
+FARTHEST_M = 100.0
+"""No hand gets so far, and no board: these are other units, or a digit too many."""
+
 EQUAL_SPREAD = np.diag(np.square(np.repeat([np.deg2rad(0.2), 1e-3], 3)))
 """Covariance of a board's pose where none is stated."""
 
@@ -232,4 +235,8 @@ def _poses(what: str, poses: Sequence[np.ndarray]) -> np.ndarray:
     bad = np.flatnonzero(~rigid | (np.linalg.det(turns) < 0) | (array[:, 3] != (0, 0, 0, 1)).any(1))
     if len(bad):
         raise UserError(f"pose {bad[0] + 1} of the {what} is no rotation and translation")
+    away = np.abs(array[:, :3, 3]).max(1)
+    if (away > FARTHEST_M).any():
+        i = int(np.argmax(away > FARTHEST_M))
+        raise UserError(f"pose {i + 1} of the {what} is {away[i]:.3g} m away: give metres")
     return array

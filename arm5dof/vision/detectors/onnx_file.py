@@ -5,6 +5,7 @@ The file is one protobuf message. The few fields needed are read by their number
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,11 @@ from pathlib import Path
 from arm5dof.errors import UserError
 
 MODEL_GRAPH, MODEL_METADATA = 7, 14
-GRAPH_INITIALIZER, GRAPH_INPUT = 5, 11
-TENSOR_NAME = 8
+GRAPH_NODE, GRAPH_INITIALIZER, GRAPH_INPUT = 1, 5, 11
+NODE_TEXTS, NODE_ATTRIBUTE, ATTRIBUTE_NAME, ATTRIBUTE_TENSOR = (1, 2, 3, 4, 7), 5, 1, 5
+TENSOR_DIMS, TENSOR_TYPE, TENSOR_NAME, TENSOR_RAW = 1, 2, 8, 9
+BYTES_OF = {1: 4, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 8, 9: 1, 10: 2, 11: 8, 12: 4, 13: 8, 16: 2}
+"""Of one number of a tensor, by its type."""
 VALUE_NAME, VALUE_TYPE = 1, 2
 TYPE_TENSOR, TENSOR_KIND, TENSOR_SHAPE, SHAPE_DIM, DIM_VALUE = 1, 1, 2, 1, 1
 ENTRY_KEY, ENTRY_VALUE = 1, 2
@@ -65,10 +69,39 @@ def _model(message: memoryview) -> Description:
     constants = {_text(tensor, TENSOR_NAME) for tensor in _submessages(graphs[0], GRAPH_INITIALIZER)}
     # Old files list their weights among the inputs too.
     inputs = [v for v in _submessages(graphs[0], GRAPH_INPUT) if _text(v, VALUE_NAME) not in constants]
+    _check_for_opencv(graphs[0])
     entries = _submessages(message, MODEL_METADATA)
     return Description(
         tuple(_input(value) for value in inputs), {_text(e, ENTRY_KEY): _text(e, ENTRY_VALUE) for e in entries}
     )
+
+
+def _check_for_opencv(graph: memoryview) -> None:
+    """Raise `ValueError` for what would not be an error in OpenCV but the end of the process: names that are no text,
+    with which it tells of errors, and tensors of other sizes than their shapes."""
+    tensors = list(_submessages(graph, GRAPH_INITIALIZER))
+    for node in _submessages(graph, GRAPH_NODE):
+        attributes = _submessages(node, NODE_ATTRIBUTE)
+        names = [name for number in NODE_TEXTS for name in _submessages(node, number)]
+        for name in (*names, *(name for a in attributes for name in _submessages(a, ATTRIBUTE_NAME))):
+            bytes(name).decode()
+        tensors += [tensor for a in attributes for tensor in _submessages(a, ATTRIBUTE_TENSOR)]
+    for tensor in tensors:
+        shape, kinds, raw = _dims(tensor), _numbers(tensor, TENSOR_TYPE), _submessages(tensor, TENSOR_RAW)
+        size = math.prod(shape) * BYTES_OF.get(kinds[-1] if kinds else 0, 0)
+        if any(n >= MAX_LENGTH for n in shape) or (raw and size and size != len(raw[-1])):
+            raise ValueError(f"the tensor {_text(tensor, TENSOR_NAME)!r} is not as large as its shape")
+
+
+def _dims(tensor: memoryview) -> list[int]:
+    """A tensor's shape: a field for each length, or all in one."""
+    shape = _numbers(tensor, TENSOR_DIMS)
+    for packed in _submessages(tensor, TENSOR_DIMS):
+        at = 0
+        while at < len(packed):
+            length, at = _varint(packed, at)
+            shape.append(length)
+    return shape
 
 
 def _input(value: memoryview) -> Input:

@@ -143,8 +143,13 @@ def test_poses_that_cannot_be_are_refused():
             eye_in_hand(wrong_hands, wrong_seen)
     millimetres = hands.copy()
     millimetres[:, :3, 3] *= 1000
-    with pytest.raises(UserError, match=r"contradict each other by .* give metres"):
+    with pytest.raises(UserError, match=r"pose 1 of the hand is \d+ m away: give metres"):
         eye_in_hand(millimetres, seen)
+    for far in (4294967296.0, 1e300):  # A digit too many in one cell.
+        away = hands.copy()
+        away[2, 1, 3] = far
+        with pytest.raises(UserError, match=r"pose 3 of the hand is \S+ m away: give metres"):
+            eye_in_hand(away, seen)
     for change in (np.diag([1, 1, -1, 1.0]), np.diag([2, 1, 1, 1.0]), np.full((4, 4), np.nan)):
         broken = hands.copy()
         broken[2] = broken[2] @ change

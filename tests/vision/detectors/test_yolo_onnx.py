@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 from helpers.errors import said
-from helpers.onnx_bytes import NAMES, SIZE, UINT8, constant, output
+from helpers.onnx_bytes import NAMES, SIZE, UINT8, constant, output, tensor
 
 from arm5dof.errors import UserError
 from arm5dof.vision.detectors.yolo_onnx import OnnxYOLO
@@ -200,12 +200,14 @@ def test_inputs_that_are_no_image_are_refused(tmp_path, shape):
 
 def test_damaged_files_are_refused(tmp_path):
     whole = constant(tmp_path / "x.onnx", output("yolov5")).read_bytes()
-    start = whole.index(b"Reshape")
+    start, zero = whole.index(b"Reshape"), tensor("zero", np.zeros((3, 1), np.float32))
     contents = {
         "cut": whole[: len(whole) // 2],
         "text": b"hello, this is no network",
         "empty": b"",
         "operator": whole[:start] + b"Rezhape" + whole[start + 7 :],
+        "no_text": whole[:start] + b"Re\xb8hape" + whole[start + 7 :],  # Of which OpenCV's error is none either.
+        "small": whole.replace(zero, zero.replace(b"\x08\x03", b"\x08\x7f")),
     }
     for name, content in contents.items():
         (tmp_path / f"{name}.onnx").write_bytes(content)

@@ -33,6 +33,7 @@ DAMAGED = (
     TypeError,
     EOFError,
     AttributeError,
+    MemoryError,
 )
 """What NumPy raises for files that are no archives of arrays."""
 

@@ -59,6 +59,11 @@ def damaged(kind, path, tmp_path):
             np.save(array, np.zeros(3))
             with zipfile.ZipFile(content, "w") as archive:
                 archive.writestr("class_names.npy", array.getvalue().replace(b"}", b"("))
+        case "huge":
+            array = io.BytesIO()
+            np.save(array, np.zeros(3))
+            with zipfile.ZipFile(content, "w") as archive:
+                archive.writestr("class_names.npy", array.getvalue().replace(b"(3,)", b"(9999999999999,)"))
         case "missing":
             arrays.pop("refiner/logits/bias")
             np.savez(content, **arrays)
@@ -84,7 +89,7 @@ class Bomb:
 DAMAGES = ["cut", "empty", "text", "flipped", "foreign", "array", "missing", "shape", "classes", "pickle"]
 
 
-@pytest.mark.parametrize("kind", [*DAMAGES, "header", "not finite", "text for numbers"])
+@pytest.mark.parametrize("kind", [*DAMAGES, "header", "huge", "not finite", "text for numbers"])
 def test_damaged_and_foreign_weights_are_refused(good, tmp_path, kind):
     with pytest.raises(UserError, match="train the tabletop detector") as error:
         TabletopDetector(damaged(kind, good, tmp_path))
