@@ -30,7 +30,7 @@ CLOSED: tuple[tuple[str, int, tuple[str, ...]], ...] = (
 """What of a run is closed, to which mode, and what is tried then."""
 EXCHANGED = ("config.toml", "run.json", "model.mjb.gz", "model.zip", "metrics.csv", "evaluations.json", "checkpoints")
 OF_A_CHECKPOINT = ("", "/networks", "/training", "/record")
-GROWS = (".lock", "config.toml", "metrics.csv")
+GROWS = (".lock", "metrics.csv")
 """What a training that goes on writes to first."""
 PR_CAPBSET_DROP = 24
 

@@ -30,7 +30,7 @@ def signals(work: Path, seed: int, say: Callable[[int, int], None], kills: int =
     for process in both:
         process.communicate()
     lasts, right = time.monotonic() - started, fingerprint(here / "whole")
-    moments = np.random.default_rng(seed).uniform(0.05, 1.0, kills + ends) * lasts
+    moments = np.random.default_rng(seed).uniform(0.05, 0.8, kills + ends) * lasts
 
     def one(number: int) -> Case:
         kind = signal.SIGKILL if number < kills else signal.SIGTERM
