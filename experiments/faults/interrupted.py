@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,18 +31,23 @@ def signals(work: Path, seed: int, say: Callable[[int, int], None], kills: int =
     for process in both:
         process.communicate()
     lasts, right = time.monotonic() - started, fingerprint(here / "whole")
-    moments = np.random.default_rng(seed).uniform(0.05, 0.8, kills + ends) * lasts
+    moments = np.random.default_rng(seed).uniform(0.05, 1.0, kills + ends) * lasts
 
     def one(number: int) -> Case:
         kind = signal.SIGKILL if number < kills else signal.SIGTERM
         out = here / str(number)
-        process = subprocess.Popen(command(*LONGER, f"--out={out.name}"), **quiet)
-        try:
-            _, said = process.communicate(timeout=moments[number])
-        except subprocess.TimeoutExpired:
-            process.send_signal(kind)
-            _, said = process.communicate()
-        name = f"{kind.name} at {moments[number]:.1f} of {lasts:.1f} s"
+        moment, ended = moments[number], True
+        while ended:  # Before the signal, if the machine has become faster: another one is signalled earlier.
+            shutil.rmtree(out, ignore_errors=True)
+            process = subprocess.Popen(command(*LONGER, f"--out={out.name}"), **quiet)
+            try:
+                _, said = process.communicate(timeout=moment)
+                moment /= 2
+            except subprocess.TimeoutExpired:
+                ended = False
+                process.send_signal(kind)
+                _, said = process.communicate()
+        name = f"{kind.name} at {moment:.1f} of {lasts:.1f} s"
         # Of one that died, a child that MuJoCo's imports have started may complain.
         if process.returncode not in (-kind, 128 + kind, 0, 1) or (process.returncode >= 0 and b"Traceback" in said):
             return Case(name, False, f"status {process.returncode}: {said.decode()[-300:]}")
