@@ -17,8 +17,8 @@ lint: .venv/installed
 
 .venv/installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --no-deps --editable .
 	touch $@
 
 # Maintainers: resolve anew. One jax for every Python: the newest that the XLA flag in arm5dof/runtime/xla.py is known for.

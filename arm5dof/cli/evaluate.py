@@ -37,5 +37,5 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     with Bar("evaluating", args.targets or opened.config.evaluate.targets, "targets") as bar:
         results = opened.evaluate(args.targets, args.seed, bar.update)
     metrics = opened.env.metrics
-    shown = {name: summary for name, summary in results.items() if name in metrics}
+    shown = {name: found for name, found in results.items() if name in metrics or (name == "counts" and found)}
     print(files.to_json(shown) if args.json else tables(metrics, shown))

@@ -48,8 +48,8 @@ def evaluate(
         progress: Told the number of targets done, now and then.
 
     Returns:
-        By name of the task's metrics what was measured, summarised as the metric says; and `means`, the mean of every
-        array measured, in SI units.
+        By name of the task's metrics what was measured, summarised as the metric says; `means`, the mean of every array
+        measured, in SI units; and `counts`, of how many targets, of what was measured on fewer than all.
     """
     forks.check()
     key = _stream(seed)
@@ -96,7 +96,12 @@ def _stream(seed: int) -> jax.Array:
 def _summarised(env: Task, found: Mapping[str, np.ndarray]) -> dict[str, Any]:
     # JAX returns dictionaries sorted; people read them in the task's order.
     results: dict[str, Any] = {name: m.summary(found[name]) for name, m in env.metrics.items() if name in found}
-    return {**results, "means": {name: float(values.mean()) for name, values in found.items()}}
+    counts = {name: len(values) for name, values in found.items()}
+    return {
+        **results,
+        "means": {name: float(values.mean()) for name, values in found.items()},
+        "counts": {name: count for name, count in counts.items() if count < max(counts.values())},
+    }
 
 
 def tables(metrics: Mapping[str, Metric], results: Mapping[str, Any]) -> str:
@@ -105,7 +110,9 @@ def tables(metrics: Mapping[str, Metric], results: Mapping[str, Any]) -> str:
     for name, metric in metrics.items():
         if name in results:
             cells = metric.cells(results[name])
-            by_header.setdefault(tuple(cells), []).append([name, *cells.values()])
+            count = results.get("counts", {}).get(name)
+            title = f"{name}, {count} of these" if count else name
+            by_header.setdefault(tuple(cells), []).append([title, *cells.values()])
     return "\n\n".join(Table("", ("", *header), rows).markdown() for header, rows in by_header.items())
 
 

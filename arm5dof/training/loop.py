@@ -222,7 +222,7 @@ class Evaluations:
         results = evaluate.evaluate(self.made.policy(), targets, self.run.config.train.seed, show)
         self.reporter.say(
             f"episode {at.episodes}: {env.metrics[env.headline].text(results[env.headline])} "
-            f"({env.headline}, {targets} unseen targets)"
+            f"({env.headline}, {results['counts'].get(env.headline, targets)} unseen targets)"
         )
         return {**at._asdict(), "targets": targets, **results}
 

@@ -81,11 +81,13 @@ def test_what_is_learnt_without_physics_holds_in_it(soft: Arm, seed: int, tmp_pa
         num_envs=25,
         evaluate_every=25,
         checkpoint_every=25,
-        targets=500,
-        interim_targets=500,
+        targets=5000,
     )
-    within = train(config, tmp_path / "run").evaluations[-1]["episode"]["within"]
+    run = train(config, tmp_path / "run")
+    (last,) = run.evaluations
+    within = last["episode"]["within"]
     assert within["5"] >= 99 and within["1"] >= 97
+    assert last["counts"] == {"episode": 500} and "| episode, 500 of these |" in (run.folder / "report.md").read_text()
 
 
 def test_a_policy_whose_servos_fail_is_told_of(env: Reach):
