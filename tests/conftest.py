@@ -13,9 +13,9 @@ from hypothesis import settings
 
 from arm5dof.runtime import xla
 
-# JAX reads these settings when it is imported, so nothing above may import it, and the fixtures below import late. Most of
-# the time of tests goes into compiling what then runs once: LLVM need not try hard, and hardly any of the objects that
-# tracing makes are garbage.
+# JAX reads these settings when it is imported, so nothing above may import it, and the fixtures below import late.
+# Most of the time of tests goes into compiling what then runs once: LLVM need not try hard, and hardly any of the
+# objects that tracing makes are garbage.
 os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}".strip()
 xla.enable_compilation_cache()
 gc.set_threshold(100_000, 50, 100)

@@ -354,8 +354,8 @@ class ArmGoalEnv(Task):
         state = jax.vmap(self.start)(self.arm.sample(pose_key, (n,)), goals)
         refined = solve(self, act, goals, self.config.refinements)
         if self._servos:
-            some = jax.tree.map(lambda x: x[::SPARED], (refined.answer.q, state))
-            episode = settled(self, self._servos, *some, self.config.refinements)
+            told, some = jax.tree.map(lambda x: x[::SPARED], (refined.answer.q, state))
+            episode = settled(self, self._servos, told, some, self.config.refinements)
         else:
             episode = corrected(self, act, state, goals, self.config.refinements)
         kinds = {
