@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -14,7 +12,7 @@ import numpy as np
 from mujoco.rollout import Rollout
 
 from arm5dof.arm.arm import Arm
-from arm5dof.runtime import xla
+from arm5dof.runtime import models, xla
 
 STILL = 1e-3
 """Radians (metres) a second: slower joints are at rest."""
@@ -81,7 +79,7 @@ class Servos:
         told, was = (values.reshape(len(states), -1).astype(float) for values in (ctrl, before))
         moving, done = np.flatnonzero((told != was).any(-1)), 0
         ramp = self._ramp(was, told)
-        with _without_warnings():
+        with models.overheard():  # Physics that blows up is an answer here.
             while len(moving) and done < ramp[moving].max() + self.most:
                 states[moving], still = self._advance(states[moving], was[moving], told[moving], ramp[moving], done)
                 done += CHUNK
@@ -97,7 +95,7 @@ class Servos:
         asked = np.abs((told - was)[:, self.arm.actuators] / self.arm.servo[:, 0]).max(-1, keepdims=True)
         way = np.empty((MOVES, 0, self.arm.dof))
         moving = np.ones(MOVES, bool)
-        with _without_warnings():
+        with models.overheard():  # Physics that blows up is an answer here.
             while moving.sum() > (1 - SHARE) * MOVES:
                 if way.shape[1] >= self.most:
                     return None
@@ -118,7 +116,7 @@ class Servos:
         rest, for eight of ten; None if it does not come to rest, NaN if its physics blows up in more than two."""
         states, was, told = self._moves()
         ramp, done, ends = self._ramp(was, told), 0, np.full(MOVES, np.inf)
-        with _without_warnings():
+        with models.overheard():  # Physics that blows up is an answer here.
             while done < ramp.max() + self.most and not np.isfinite(ends).all():
                 states, still = self._advance(states, was, told, ramp, done)
                 done += CHUNK
@@ -174,14 +172,3 @@ class Servos:
     def _data(self) -> list[mujoco.MjData]:
         """One for each thread."""
         return [mujoco.MjData(self.model) for _ in range(xla.cores())]
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Physics that blows up is an answer here: nothing on stderr, and no MUJOCO_LOG.TXT in the user's folder."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
