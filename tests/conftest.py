@@ -16,7 +16,8 @@ from arm5dof.runtime import xla
 # JAX reads these settings when it is imported, so nothing above may import it, and the fixtures below import late.
 # Most of the time of tests goes into compiling what then runs once: LLVM need not try hard, and hardly any of the
 # objects that tracing makes are garbage.
-os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}".strip()
+FAST = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+os.environ["XLA_FLAGS"] = f"{FAST} {os.environ.get('XLA_FLAGS', '')}".strip()
 xla.enable_compilation_cache()
 gc.set_threshold(100_000, 50, 100)
 

@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 
 from arm5dof.envs.base import Act, ForwardModel, Goal
 
@@ -39,6 +40,10 @@ class Candidate(NamedTuple):
     action: jax.Array
     answer: Answer
     reward: jax.Array
+
+
+for kind in (Answer, Candidate):  # So that programs that return them can be kept.
+    export.register_namedtuple_serialization(kind, serialized_name=f"arm5dof.{kind.__name__}")
 
 
 def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candidate:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from annotated_types import Gt
+from jax import export
 
 from arm5dof.arm import se3
 from arm5dof.envs.arm_goal import AT_LIMIT, ArmGoalConfig, ArmGoalEnv
@@ -48,6 +49,9 @@ class PoseGoal(NamedTuple):
     """(3,) metres in the world frame."""
     directions: jax.Array
     """(1, 3) or (3, 3), unit vectors in the world frame."""
+
+
+export.register_namedtuple_serialization(PoseGoal, serialized_name="arm5dof.PoseGoal")  # See `inverse_kinematics`.
 
 
 class ReachPose(ArmGoalEnv):

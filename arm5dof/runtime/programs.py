@@ -23,6 +23,9 @@ from jax import export
 from arm5dof.runtime import files, xla
 
 PACKAGE = Path(__file__).parents[1]
+MOST_JITTED = 16
+"""Programs that a process keeps, by the last use; each takes memory."""
+_JITTED: dict[str, Any] = {}
 TRACED_BY = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -54,7 +57,18 @@ class Program:
         return export.deserialize(bytearray(program)) if hashlib.sha256(program).digest() == checksum else None
 
     def jit(self, **options: Any) -> Any:
-        """`jax.jit(function, **options)`, its trace read from disk or kept there."""
+        """`jax.jit(function, **options)`, its trace read from disk or kept there, and what it makes of it kept by this
+        process."""
+        if self._path is None:
+            return self._jit(options)
+        name = f"{self._path} {sorted(options.items())}"
+        found = _JITTED.pop(name, None) or self._jit(options)
+        _JITTED[name] = found
+        if len(_JITTED) > MOST_JITTED:
+            del _JITTED[next(iter(_JITTED))]
+        return found
+
+    def _jit(self, options: dict[str, Any]) -> Any:
         exported = self.kept
         if exported is None and self._path:
             try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Annotated, Any
 
 import jax
@@ -17,6 +16,7 @@ from arm5dof.runtime import forks
 from arm5dof.runtime.tables import Table
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
+from arm5dof.training.policy_program import of_policy
 
 CHUNK = 1000
 """Samples in one device call: what the progress bar moves by, and no more memory than a training batch."""
@@ -56,7 +56,7 @@ def evaluate(
     chunk = min(CHUNK, targets)
     parts: dict[str, list[np.ndarray]] = {}
     for done in range(0, targets, chunk):
-        measured = _measure(policy.env, policy, jax.random.fold_in(key, done), chunk)
+        measured = _measure(policy, jax.random.fold_in(key, done), n=chunk)
         for name, values in measured.items():
             parts.setdefault(name, []).append(np.asarray(values)[: targets - done])
         if progress:
@@ -80,7 +80,7 @@ def evaluate_together(policies: Policy, targets: int, seeds: Sequence[int]) -> l
     parts: dict[str, list[np.ndarray]] = {}
     for done in range(0, targets, chunk):
         folded = jax.vmap(jax.random.fold_in, (0, None))(keys, done)
-        for name, values in _measure_together(policies.env, policies, folded, chunk).items():
+        for name, values in _measure_together(policies, folded, n=chunk).items():
             parts.setdefault(name, []).append(np.asarray(values)[:, : targets - done])
     found = {name: np.concatenate(values, axis=1) for name, values in parts.items()}
     return [_summarised(policies.env, {k: v[i] for k, v in found.items()}) for i in range(len(seeds))]
@@ -116,11 +116,11 @@ def tables(metrics: Mapping[str, Metric], results: Mapping[str, Any]) -> str:
     return "\n\n".join(Table("", ("", *header), rows).markdown() for header, rows in by_header.items())
 
 
-@partial(jax.jit, static_argnames=("env", "n"))
-def _measure(env: Task, policy: Policy, key: jax.Array, n: int) -> dict[str, jax.Array]:
-    return env.evaluate(policy, key, n)
+@of_policy()
+def _measure(policy: Policy, key: jax.Array, n: int) -> dict[str, jax.Array]:
+    return policy.env.evaluate(policy, key, n)
 
 
-@partial(jax.jit, static_argnames=("env", "n"))
-def _measure_together(env: Task, policies: Policy, keys: jax.Array, n: int) -> dict[str, jax.Array]:
-    return jax.vmap(lambda policy, key: env.evaluate(policy, key, n))(policies, keys)
+@of_policy()
+def _measure_together(policies: Policy, keys: jax.Array, n: int) -> dict[str, jax.Array]:
+    return jax.vmap(lambda policy, key: policy.env.evaluate(policy, key, n))(policies, keys)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache, lru_cache, partial
-from inspect import signature
 from typing import Any
 
 import jax
@@ -20,6 +18,7 @@ from arm5dof.envs.paths import Path
 from arm5dof.errors import UserError
 from arm5dof.runtime import forks, xla
 from arm5dof.runtime.tables import Table
+from arm5dof.training.policy_program import of_policy
 
 AT_ONCE = 4_096
 """Goals in one device call: more take memory, and on a CPU, beyond its caches, more time each."""
@@ -129,16 +128,16 @@ class Policy(struct.PyTreeNode, eq=False):
             turns, stops = self.forward_model.turns, self.forward_model.stops
             found, met = self._candidates(goals, corrections)
             if corrections and not met.any(0).all():
-                best = jax.tree.map(lambda x: x[None], _solve(self.forward_model, self, goals, corrections))
+                best = jax.tree.map(lambda x: x[None], _solve(self, goals, corrections=corrections))
                 found = jax.tree.map(lambda *parts: jnp.concatenate(parts), found, best)
                 met = self._met(found.answer)
             which = paths.nearest(np.asarray(found.answer.q), met, np.asarray(found.reward), turns, near)
             answer = _pick(found, which)
             return answer._replace(q=jnp.asarray(paths.beside(np.asarray(answer.q), near, turns, stops)))
         if candidates:
-            found = _ask(self.forward_model, self, goals, corrections, self.forward_model.branches)
+            found = _ask(self, goals, corrections=corrections, branches=self.forward_model.branches)
             return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), found.answer)
-        return _solve(self.forward_model, self, goals, corrections).answer
+        return _solve(self, goals, corrections=corrections).answer
 
     def solve_all(self, *target: Any, corrections: int = 10, **inputs: Any) -> Answer:
         """Every distinct answer of the actor to one goal, the best first.
@@ -230,7 +229,7 @@ class Policy(struct.PyTreeNode, eq=False):
 
     def _candidates(self, goals: Goal, corrections: int) -> tuple[Candidate, np.ndarray]:
         """The answers of all the actor's heads, (k, n), and which meet their goals."""
-        found = _ask(self.forward_model, self, goals, corrections, None)
+        found = _ask(self, goals, corrections=corrections, branches=None)
         return found, self._met(found.answer)
 
     def _met(self, answer: Answer | Path) -> np.ndarray:
@@ -264,20 +263,14 @@ def _forward_model(env: Task) -> ForwardModel:
     return env
 
 
-def _solve(env: ForwardModel, policy: Policy, goals: Goal, corrections: int) -> Candidate:
-    """Compiled once for an environment and an agent, whatever the networks."""
-    return _compiled(inverse_kinematics.solve)(env, policy, goals, corrections)
+@of_policy(xla.fusion_emitters)  # Networks and no physics: the emitters make them twice as fast.
+def _solve(policy: Policy, goals: Goal, corrections: int) -> Candidate:
+    return inverse_kinematics.solve(policy.forward_model, policy, goals, corrections)
 
 
-def _ask(env: ForwardModel, policy: Policy, goals: Goal, corrections: int, branches: int | None) -> Candidate:
-    return _compiled(inverse_kinematics.candidates)(env, policy, goals, corrections, branches)
-
-
-@cache
-def _compiled(function: Callable[..., Candidate]) -> Callable[..., Candidate]:
-    """A function of `inverse_kinematics`: without physics, and with networks, which the emitters make twice as fast."""
-    static = [name for name in ("env", "corrections", "branches") if name in signature(function).parameters]
-    return jax.jit(function, static_argnames=static, compiler_options=xla.fusion_emitters())
+@of_policy(xla.fusion_emitters)
+def _ask(policy: Policy, goals: Goal, corrections: int, branches: int | None) -> Candidate:
+    return inverse_kinematics.candidates(policy.forward_model, policy, goals, corrections, branches)
 
 
 @partial(jax.jit, static_argnames="env")

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import jax
@@ -21,6 +21,7 @@ from arm5dof.runtime import forks, xla
 from arm5dof.runtime.programs import Program
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
+from arm5dof.training.policy_program import of_policy
 
 Count = Annotated[int, Ge(1), Lt(2**31)]
 
@@ -214,7 +215,7 @@ class Trainer:
     def _watch(self) -> dict[str, jax.Array]:
         """What the task has to watch, on random numbers that neither training nor evaluation uses."""
         policy = Policy(self.env, self.agent, self.config.ddpg, self.state.networks)
-        return _watched(self.env, policy, jax.random.fold_in(jax.random.key(self.config.train.seed), WATCHED))
+        return _watched(policy, jax.random.fold_in(jax.random.key(self.config.train.seed), WATCHED))
 
     @property
     def counters(self) -> Counters:
@@ -247,9 +248,9 @@ class Trainer:
         return Policy(self.env, self.agent, self.config.ddpg, networks)
 
 
-@partial(jax.jit, static_argnames="env")
-def _watched(env: Task, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
-    return env.watch(policy, key)
+@of_policy()
+def _watched(policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
+    return policy.env.watch(policy, key)
 
 
 def memory_free() -> int:

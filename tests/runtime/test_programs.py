@@ -12,9 +12,11 @@ import pytest
 from arm5dof.arm import Arm, load_arm
 from arm5dof.ddpg import DDPG
 from arm5dof.envs.reach import Reach, ReachConfig
-from arm5dof.runtime import xla
+from arm5dof.runtime import programs, xla
 from arm5dof.runtime.programs import Program
+from arm5dof.training import policy_program
 from arm5dof.training.config import Config, build
+from arm5dof.training.evaluate import evaluate
 from arm5dof.training.loop import make_trainer
 from arm5dof.training.trainer import Trainer
 
@@ -41,6 +43,8 @@ def unexpected(*_: object) -> None:
 
 
 def program(*identity: object, function=wave, x: jax.Array = X) -> Program:
+    """As another process would see it."""
+    programs._JITTED.clear()
     unexpected.__name__ = "wave"  # What a program is called is a part of what it is found by.
     return Program(function, (x, {"by": 2.0}), identity)
 
@@ -54,6 +58,16 @@ def test_a_kept_program_is_not_traced_again(folder: Path):
         for left, right in zip(values, direct, strict=True):
             np.testing.assert_array_equal(left, right)
     assert [path.name.split("-")[0] for path in folder.iterdir()] == ["wave"]
+
+
+def test_a_process_makes_a_program_once(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    first = program("arm").jit(donate_argnums=0)
+    again = Program(unexpected, (X, {"by": 2.0}), ("arm",))
+    assert again.jit(donate_argnums=0) is first
+    monkeypatch.setattr(programs, "MOST_JITTED", 2)
+    assert again.jit(donate_argnums=1) is not first
+    again.jit()
+    assert again.jit(donate_argnums=0) is not first
 
 
 @pytest.mark.parametrize(
@@ -117,6 +131,9 @@ def test_a_program_that_jax_cannot_keep_runs(folder: Path):
 
 
 def trained(trainer: Trainer) -> list[np.ndarray]:
+    """As another process would see it."""
+    programs._JITTED.clear()
+    policy_program._compiled.cache_clear()
     trainer.start()
     for _ in range(3):
         trainer.advance()
@@ -136,6 +153,25 @@ def test_training_has_the_same_bits_with_and_without(folder: Path, monkeypatch: 
     monkeypatch.setattr(xla, "_programs", None)
     without = trained(make_trainer(settings()))
     for a, b, c in zip(kept, again, without, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+
+
+def test_answers_and_evaluations_have_the_same_bits_with_and_without(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    def answers() -> list[np.ndarray]:
+        trainer = make_trainer(settings())
+        trained(trainer)
+        policy = trainer.policy()
+        found = policy.solve([[0.15, 0.05, 0.12]] * 3, corrections=1), policy.solve([0.15, 0.05, 0.12])
+        return [np.asarray(x) for x in jax.tree.leaves((evaluate(policy, 10)["means"], found))]
+
+    kept = answers()
+    assert {path.name.split("-")[0] for path in folder.iterdir()} == {"epoch", "measure", "solve", "watched"}
+    monkeypatch.setattr(Reach, "question", unexpected)
+    again = answers()
+    monkeypatch.undo()
+    monkeypatch.setattr(xla, "_programs", None)
+    for a, b, c in zip(kept, again, answers(), strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
 

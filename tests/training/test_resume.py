@@ -40,9 +40,9 @@ def rows(folder):
     return len(path.read_text().splitlines()) - 1 if path.exists() else -1
 
 
-def kill_after(folder, epochs, delay):
-    """Start a run and kill it `delay` seconds after that many epochs; -1 means while it is still starting."""
-    process = subprocess.Popen(command("kinematic.toml", *SETTINGS.split(), "--out", folder))
+def kill_after(words, folder, epochs, delay):
+    """Start or resume a run and kill it `delay` seconds after that many epochs; -1 means while it is still starting."""
+    process = subprocess.Popen(command(*words))
     while process.poll() is None and (not folder.exists() or rows(folder) < epochs):
         time.sleep(0.005)
     time.sleep(delay)
@@ -51,17 +51,20 @@ def kill_after(folder, epochs, delay):
 
 
 def test_kill_and_resume_ends_with_the_same_bits(tmp_path):
-    reference = tmp_path / "reference"
+    """One run, killed again and again: while it starts, on its way, and after it was resumed."""
+    reference, folder = tmp_path / "reference", tmp_path / "killed"
     subprocess.run(command("kinematic.toml", *SETTINGS.split(), "--out", reference), check=True)
     expected = final_state(reference)
 
     moments = random.Random(0)
-    for epochs in (-1, *(moments.randrange(rows(reference) - 5) for _ in range(KILLS - 1))):
-        folder = tmp_path / f"killed-{epochs}"
-        assert kill_after(folder, epochs, moments.uniform(0, 0.3)) == -signal.SIGKILL
-        subprocess.run(command("--resume", folder), check=True)
-        found = final_state(folder)
-        assert found.keys() == expected.keys()
-        for name, value in expected.items():
-            np.testing.assert_array_equal(found[name], value, err_msg=f"{name}, killed after {epochs} epochs")
-        assert rows(folder) == rows(reference)
+    later = sorted(moments.randrange(rows(reference) - 5) for _ in range(KILLS - 1))
+    words = ("kinematic.toml", *SETTINGS.split(), "--out", folder)
+    for epochs in (-1, *later):
+        assert kill_after(words, folder, epochs, moments.uniform(0, 0.3)) == -signal.SIGKILL
+        words = ("--resume", folder)
+    subprocess.run(command("--resume", folder), check=True)
+    found = final_state(folder)
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
+    assert rows(folder) == rows(reference)
