@@ -171,8 +171,8 @@ def profile() -> dict[str, float]:
     collect = jit(agent.collect)
 
     def draw(t):
-        batches = agent.relabel(ddpg, t.replay, t.replay.sample(key, shape), key)
-        return batches, agent.critic_inputs(ddpg, batches)
+        batches, shown = agent.relabel(ddpg, t.replay, t.replay.sample(key, shape), key)
+        return batches, agent.critic_inputs(ddpg, batches), shown
 
     draw = jit(draw)
     batches = draw(state)
