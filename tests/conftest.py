@@ -13,13 +13,14 @@ from hypothesis import settings
 
 from arm5dof.runtime import xla
 
-# JAX reads these settings when it is imported, so nothing above may import it, and the fixtures below import late.
-# Most of the time of tests goes into compiling what then runs once: LLVM need not try hard, and hardly any of the
-# objects that tracing makes are garbage.
+# JAX and NumPy read these settings when they are imported, so nothing above may import them, and the fixtures below
+# import late. Most of the time of tests goes into compiling what then runs once: LLVM need not try hard. Each worker has
+# a core to itself: threads of linear algebra would only wait for each other.
 FAST = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 os.environ["XLA_FLAGS"] = f"{FAST} {os.environ.get('XLA_FLAGS', '')}".strip()
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 xla.enable_compilation_cache()
-gc.set_threshold(100_000, 50, 100)
+gc.set_threshold(100_000, 50, 100)  # Hardly any of the objects that tracing makes are garbage.
 
 if TYPE_CHECKING:
     from arm5dof.arm import Arm
