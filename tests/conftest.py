@@ -14,8 +14,8 @@ from hypothesis import settings
 from arm5dof.runtime import xla
 
 # JAX and NumPy read these settings when they are imported, so nothing above may import them, and the fixtures below
-# import late. Most of the time of tests goes into compiling what then runs once: LLVM need not try hard. Each worker has
-# a core to itself: threads of linear algebra would only wait for each other.
+# import late. Most of the time of tests goes into compiling what then runs once: LLVM need not try hard. Each worker
+# has a core to itself: threads of linear algebra would only wait for each other.
 FAST = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 os.environ["XLA_FLAGS"] = f"{FAST} {os.environ.get('XLA_FLAGS', '')}".strip()
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
