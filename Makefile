@@ -17,7 +17,7 @@ lint: .venv/installed
 
 .venv/installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --no-deps --requirement requirements.lock
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --no-deps --editable .
 	touch $@
 

@@ -28,12 +28,12 @@ def small(tmp_path_factory):
 def learner():
     """Of the proposer: compiled once."""
     loss = partial(proposer_losses, centers=cell_centers(WINDOW, WINDOW))
-    return Learner(Proposer(training=True), loss, (np.zeros((1, WINDOW, WINDOW, 3), np.uint8),), 150, 0)
+    return Learner(Proposer(training=True), loss, (np.zeros((1, WINDOW, WINDOW, 3), np.uint8),), 100, 0)
 
 
 def test_the_proposer_learns_two_windows_by_heart(small, learner):
     (windows,), (labels,) = window_batch(small, (0,), 2)
-    for _ in range(150):
+    for _ in range(100):
         parts = learner.step((windows,), (labels,))
     assert sum(float(value) for value in parts.values()) < 0.7
     boxes, logits = jax.jit(Proposer(False).apply)({"params": learner.weights()}, windows)
