@@ -34,16 +34,6 @@ settings.register_profile("arm5dof", deadline=None, derandomize=True, max_exampl
 settings.load_profile("arm5dof")
 
 
-EFFORT = xla.effort
-xla.effort = lambda level: EFFORT(0)
-
-
-@pytest.fixture
-def compiled_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For a test that trains for longer than it takes to compile as users do, or that compares bits with theirs."""
-    monkeypatch.setattr(xla, "effort", EFFORT)
-
-
 @pytest.fixture(scope="session")
 def test_data() -> Path:
     """The folder of real data that is no part of the project: photographs, calibrations, weights."""

@@ -70,7 +70,6 @@ def test_what_gravity_pulls_down_is_told_again(env: Reach, soft: Arm):
     np.testing.assert_allclose(together["distance"][1], often, atol=1e-6)
 
 
-@pytest.mark.usefixtures("compiled_well")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_what_is_learnt_without_physics_holds_in_it(soft: Arm, seed: int, tmp_path):
     soft.mj_spec.to_file(str(tmp_path / "soft.xml"))

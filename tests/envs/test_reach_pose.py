@@ -232,7 +232,6 @@ def test_a_step_and_hindsight_say_the_same(env: ReachPose):
     np.testing.assert_allclose(would.reward, -np.hypot(distance, 0.2 * np.sin(angle / 2)), atol=1e-6)
 
 
-@pytest.mark.usefixtures("compiled_well")
 def test_pointing_is_learnt_in_seconds():
     """By each of three seeds; one program serves them all."""
     short = {"episodes": 40, "num_envs": 20, "evaluate_every": 20, "checkpoint_every": 20, "updates_per_step": 48}

@@ -279,7 +279,6 @@ def test_modules_of_one_name_in_two_folders_are_not_mistaken_for_each_other(
     assert f"'archer' is {tmp_path}/mine/archer.py here and not {tmp_path}/theirs/archer.py: rename one" in text
 
 
-@pytest.mark.usefixtures("compiled_well")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_pendulum_swings_up(seed: int, monkeypatch: pytest.MonkeyPatch):
     """With the settings that ship, 10,000 transitions: a mean return above -200 over 1,000 episodes."""

@@ -75,7 +75,6 @@ def test_a_table_has_every_member_and_evaluation(done):
     assert (done.folder / "results.parquet").stat().st_size > 0
 
 
-@pytest.mark.usefixtures("compiled_well")
 @pytest.mark.parametrize("name", ["m0001", "m0002"])
 def test_a_member_is_the_run_that_train_would_make(done, name, tmp_path):
     run = done.runs[name]
