@@ -30,7 +30,8 @@ TRACED_BY = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 class Program:
-    """A function of arrays in lists, tuples and dicts, for arguments of the shapes and types of `arguments`.
+    """A function of arrays in lists, tuples and dicts (and named tuples registered with `jax.export`), for arguments of
+    the shapes and types of `arguments`.
 
     `identity` is all that it depends on besides its arguments and the source of this package: MuJoCo models, and things
     whose `repr` says what they are. With None, or where the user wants no compilation cache, nothing is kept.
