@@ -95,6 +95,8 @@ def test_mistakes_are_named_in_one_line(values, said):
         ({"batch-size": "many"}, "integer"),
         ({"discount": "2"}, "less than"),
         ({"seed": "-1"}, "greater than"),
+        ({"seed": "4294967296"}, "less than"),
+        ({"seed": "9223372036854775808"}, "less than"),
         ({"seed": "1]"}, "integer"),
     ],
 )

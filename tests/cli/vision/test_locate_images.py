@@ -226,3 +226,8 @@ def test_images_that_are_damaged_or_of_another_size_are_left_out(photo, tmp_path
     assert command(other, words, *options[:2]) == 2
     err = capfd.readouterr().err
     assert "has 320x1 pixels" in err and "; and none of the 1 others can be used" in err and err.count("\n") == 1
+
+
+def test_a_height_of_a_class_that_the_detector_does_not_know(capfd):
+    assert cli.main(["vision", "locate", "simulated", "--height", "persn=0.5"]) == 2
+    assert "the detector knows no class 'persn'; it knows: red cube," in capfd.readouterr().err
