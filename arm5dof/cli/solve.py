@@ -78,10 +78,11 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.path and args.all:
         raise UserError("--path wants one answer to each target: leave out --all")
 
+    from arm5dof.training.policy import forward_model
     from arm5dof.training.run import Run
 
-    policy = Run.open(folder).policy()
-    model = policy.forward_model
+    opened = Run.open(folder)
+    model = forward_model(opened.env)
     units = model.components
     if args.help:
         _declare_goal(args.parser, model, units)
@@ -96,6 +97,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
     if args.all and more.near is not None:
         raise UserError("--all gives every answer: leave out --near")
+    policy = opened.policy()
     answer: Answer | Line
     jumps: list[int] = []
     if args.all:

@@ -80,7 +80,7 @@ class Policy(struct.PyTreeNode, eq=False):
     @property
     def forward_model(self) -> ForwardModel:
         """The task, if it tells where an action leads. Raises `UserError` if it does not."""
-        return _forward_model(self.env)
+        return forward_model(self.env)
 
     def solve(
         self, *target: Any, corrections: int = 0, near: Any = None, candidates: bool = False, **inputs: Any
@@ -256,7 +256,7 @@ class Policy(struct.PyTreeNode, eq=False):
 
 
 @lru_cache(maxsize=8)
-def _forward_model(env: Task) -> ForwardModel:
+def forward_model(env: Task) -> ForwardModel:
     """See `Policy.forward_model`: to look whether a task has all of a protocol's attributes computes them."""
     if not isinstance(env, ForwardModel):
         raise UserError(f"the task {type(env).__name__} has no forward model: its policy only acts")
