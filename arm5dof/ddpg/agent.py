@@ -364,7 +364,7 @@ class DDPG:
         return config.discount * (1 - batch.terminal) * q
 
     def _progress(self, training: Training) -> jax.Array:
-        return jnp.minimum(training.steps / self.total_steps, 1.0)
+        return jnp.minimum(training.steps * (1 / self.total_steps), 1.0)
 
 
 def _actor_optimizer(config: DDPGConfig) -> optax.GradientTransformation:

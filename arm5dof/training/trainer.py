@@ -28,6 +28,10 @@ Count = Annotated[int, Ge(1), Lt(2**31)]
 WATCHED = 0x9B0E
 """The stream of random numbers on which a task is watched."""
 
+BRIEF_WORK, BRIEF_STEPS = 2e9, 4096
+"""A training of no more multiplications (weights times rows of all batches) and transitions takes about a second on a
+CPU. To compile it well would take longer than it gains."""
+
 
 @settings
 class TrainConfig:
@@ -177,17 +181,22 @@ class Trainer:
         config, state = jax.tree.structure(self.config.ddpg), jax.tree.structure(self.like)
         steps = self.config.train.epoch_steps
 
-        def epoch(numbers: list[float], leaves: list[jax.Array]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
-            training = jax.tree.unflatten(state, leaves)
-            training, metrics = self.agent.epoch(jax.tree.unflatten(config, numbers), training, steps)
+        def epoch(
+            numbers: list[float], total_steps: int, leaves: list[jax.Array]
+        ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+            agent = copy.copy(self.agent)
+            agent.total_steps = total_steps  # Traced: runs of any length share a program.
+            training, metrics = agent.epoch(
+                jax.tree.unflatten(config, numbers), jax.tree.unflatten(state, leaves), steps
+            )
             return jax.tree.leaves(training), metrics
 
         task = self.env.fingerprint
-        identity = None if task is None else (*task, config, self.total_steps, steps)
+        identity = None if task is None else (*task, config, steps)
         return Program(epoch, self._leaves(self.like), identity)
 
-    def _leaves(self, state: Training) -> tuple[list[float], list[jax.Array]]:
-        return jax.tree.leaves(self.config.ddpg), jax.tree.leaves(state)
+    def _leaves(self, state: Training) -> tuple[list[float], int, list[jax.Array]]:
+        return jax.tree.leaves(self.config.ddpg), self.total_steps, jax.tree.leaves(state)
 
     @cached_property
     def _simulated(self) -> bool:
@@ -197,8 +206,15 @@ class Trainer:
     @cached_property
     def _epoch(self) -> Future[jax.stages.Compiled]:
         """Compiled by a thread of its own: XLA leaves the interpreter to others meanwhile."""
-        epoch = self._program.jit(donate_argnums=1, compiler_options=xla.effort(2))
+        epoch = self._program.jit(donate_argnums=2, compiler_options=xla.effort(0 if self._brief else 2))
         return ThreadPoolExecutor(1).submit(epoch.lower(*self._leaves(self.like)).compile)
+
+    @property
+    def _brief(self) -> bool:
+        agent, networks = self.config.ddpg, self.like.networks
+        weights = sum(leaf.size for leaf in jax.tree.leaves((networks.actor, networks.critic)))
+        work = self.total_steps * agent.updates_per_step * agent.batch_size * weights
+        return work <= BRIEF_WORK and self.total_steps * self.config.train.num_envs <= BRIEF_STEPS
 
     @cached_property
     def _ready(self) -> jax.stages.Compiled:

@@ -143,8 +143,9 @@ def trained(trainer: Trainer) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves((trainer.state.networks, trainer.state.replay.rows))]
 
 
-def settings(**ddpg: float) -> Config:
-    return build({**SMALL, "ddpg": {**SMALL["ddpg"], **ddpg}}, "test")
+def settings(episodes: int = 8, **ddpg: float) -> Config:
+    train = {**SMALL["train"], "episodes": episodes}
+    return build({**SMALL, "train": train, "ddpg": {**SMALL["ddpg"], **ddpg}}, "test")
 
 
 def test_training_has_the_same_bits_with_and_without(folder: Path, monkeypatch: pytest.MonkeyPatch):
@@ -181,11 +182,12 @@ def test_answers_and_evaluations_have_the_same_bits_with_and_without(folder: Pat
 
 
 def test_numbers_share_a_program_and_sizes_do_not(folder: Path):
-    """Step sizes and the like are inputs of the program, not parts of it."""
+    """Step sizes, budgets and the like are inputs of the program, not parts of it."""
     first = trained(make_trainer(settings()))
-    other = trained(make_trainer(settings(actor_lr=1e-4)))
-    assert len(list(folder.glob("epoch-*"))) == 1
-    assert any((a != b).any() for a, b in zip(first, other, strict=True))
+    for changed in settings(actor_lr=1e-4), settings(episodes=16):
+        other = trained(make_trainer(changed))
+        assert len(list(folder.glob("epoch-*"))) == 1
+        assert any((a != b).any() for a, b in zip(first, other, strict=True))
     trained(make_trainer(settings(heads=3)))
     assert len(list(folder.glob("epoch-*"))) == 2
 
