@@ -55,7 +55,7 @@ def test_checkpoints_that_cannot_be_read_are_not_taken_for_none(folder: Path, ha
         shutil.rmtree(path)
         path.mkdir() if harm == "empty" else path.write_text("")
     before = content(folder)
-    for words in (["solve", folder, "--target=0.1", "0", "0.2"], ["eval", folder], ["train", "--resume", folder]):
+    for words in (["solve", folder, "--target", 0.1, 0, 0.2], ["eval", folder], ["train", "--resume", folder]):
         assert cli.main([str(word) for word in words]) == 2
         *_, line = capfd.readouterr().err.splitlines()
         assert line.startswith("arm5dof: ") and expected in line and "no checkpoint yet" not in line
