@@ -34,6 +34,12 @@ settings.register_profile("arm5dof", deadline=None, derandomize=True, max_exampl
 settings.load_profile("arm5dof")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def frozen() -> None:
+    """What other modules left stays: to search gigabytes of it takes most of each `gc.collect`."""
+    gc.freeze()
+
+
 @pytest.fixture(scope="session")
 def test_data() -> Path:
     """The folder of real data that is no part of the project: photographs, calibrations, weights."""
