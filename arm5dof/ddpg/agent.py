@@ -364,6 +364,7 @@ class DDPG:
         return config.discount * (1 - batch.terminal) * q
 
     def _progress(self, training: Training) -> jax.Array:
+        # What XLA makes of a division by a constant: so the bits are the same where the total is traced.
         return jnp.minimum(training.steps * (1 / self.total_steps), 1.0)
 
 
