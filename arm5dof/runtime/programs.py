@@ -62,12 +62,7 @@ class Program:
         process."""
         if self._path is None:
             return self._jit(options)
-        name = f"{self._path} {sorted(options.items())}"
-        found = _JITTED.pop(name, None) or self._jit(options)
-        _JITTED[name] = found
-        if len(_JITTED) > MOST_JITTED:
-            del _JITTED[next(iter(_JITTED))]
-        return found
+        return _shared(f"{self._path} {sorted(options.items())}", lambda: self._jit(options))
 
     def _jit(self, options: dict[str, Any]) -> Any:
         exported = self.kept
@@ -80,6 +75,24 @@ class Program:
         if exported is None:
             return jax.jit(self._function, **options)
         return jax.jit(functools.wraps(self._function)(lambda *arguments: exported.call(*arguments)), **options)
+
+
+def jit(function: Callable[..., Any], identity: Sequence[object] | None, **options: Any) -> Any:
+    """`jax.jit(function, **options)` that this process makes once for all functions of an `identity` (see `Program`,
+    but for arguments of any shapes), so that what it traces and compiles is used again."""
+    make = lambda: jax.jit(function, **options)
+    if identity is None:
+        return make()
+    return _shared(f"{_digest(function.__name__, *identity)} {sorted(options.items())}", make)
+
+
+def _shared(name: str, make: Callable[[], Any]) -> Any:
+    """What this process keeps under a name, made if it keeps none."""
+    found = _JITTED.pop(name, None) or make()
+    _JITTED[name] = found
+    if len(_JITTED) > MOST_JITTED:
+        del _JITTED[next(iter(_JITTED))]
+    return found
 
 
 def _keep(path: Path, exported: export.Exported) -> None:

@@ -17,7 +17,7 @@ from annotated_types import Ge, Lt
 from arm5dof.ddpg import DDPG, DDPGConfig, Training
 from arm5dof.envs import Task
 from arm5dof.errors import DivergedError, UserError
-from arm5dof.runtime import forks, xla
+from arm5dof.runtime import forks, programs, xla
 from arm5dof.runtime.programs import Program
 from arm5dof.settings import settings, static
 from arm5dof.training.policy import Policy
@@ -92,7 +92,9 @@ class Trainer:
                 "the most that are counted: choose fewer episodes, or more environments"
             )
         self.agent = DDPG(env, config.ddpg, budget.num_envs, length, self.total_steps)
-        self._init = jax.jit(self.agent.init, compiler_options=xla.effort(0))
+        task = env.fingerprint
+        identity = None if task is None else (*task, jax.tree.structure(config.ddpg), budget.num_envs, length)
+        self._init = programs.jit(self.agent.init, identity, compiler_options=xla.effort(0))
 
     def again(self, config: Settings) -> Trainer:
         """The same program for another configuration that differs by the agent's numbers and the seed alone, not

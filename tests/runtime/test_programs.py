@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -190,6 +191,17 @@ def test_numbers_share_a_program_and_sizes_do_not(folder: Path):
         assert any((a != b).any() for a, b in zip(first, other, strict=True))
     trained(make_trainer(settings(heads=3)))
     assert len(list(folder.glob("epoch-*"))) == 2
+
+
+def test_trainers_share_how_they_begin():
+    """What they start from is traced once in a process, for whatever seed, numbers and budget."""
+    begin = lambda **changed: make_trainer(settings(**changed))._init
+    assert begin() is begin(actor_lr=1e-4) is begin(episodes=16)
+    assert begin() is not begin(heads=3)
+    config = settings()
+    longer = replace(config, env=replace(config.env, episode_length=8))
+    more = replace(config, train=replace(config.train, num_envs=2))
+    assert len({begin(), make_trainer(longer)._init, make_trainer(more)._init}) == 3
 
 
 def test_an_environment_of_others_is_not_kept(folder: Path, arm: Arm):
