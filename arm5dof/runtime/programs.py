@@ -118,9 +118,16 @@ def _digest(*parts: object) -> str:
 
 def _surroundings() -> bytes:
     """What every program depends on: this package's source, its libraries, and JAX's configuration."""
+    return hashlib.sha256(
+        _source() + repr((jax.default_backend(), sorted(jax.config.values.items()))).encode()
+    ).digest()
+
+
+@functools.cache
+def _source() -> bytes:
+    """This package's source and its libraries, which stay as they are while a process runs."""
     digest = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
     digest.update(repr([(name, metadata.version(name)) for name in TRACED_BY]).encode())
-    digest.update(repr((jax.default_backend(), sorted(jax.config.values.items()))).encode())
     return digest.digest()
