@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import re
@@ -111,12 +112,9 @@ def _cache() -> Path:
 def check_platform() -> None:
     """Raise `UserError` if the user asked for devices that JAX does not find, or for flags that XLA does not know: it
     would end the process. It is asked in another one."""
-    if given := os.environ.get("XLA_FLAGS", "").replace(FUSION_EMITTERS, "").strip():
-        start = [sys.executable, "-c", "from jaxlib import xla_client; xla_client.make_cpu_client()"]
-        done = subprocess.run(start, capture_output=True, text=True, errors="replace", check=False)
-        if done.returncode:
-            reason = done.stderr.strip().partition("\n")[0].rpartition("] ")[2]
-            raise UserError(f"XLA_FLAGS={given} ends XLA ({reason}): mend it, or unset it")
+    given = os.environ.get("XLA_FLAGS", "").replace(FUSION_EMITTERS, "").strip()
+    if given and (reason := _ends_xla(os.environ["XLA_FLAGS"])):
+        raise UserError(f"XLA_FLAGS={given} ends XLA ({reason}): mend it, or unset it")
     asked = os.environ.get("JAX_PLATFORMS")
     if not asked:
         return
@@ -128,6 +126,16 @@ def check_platform() -> None:
         raise UserError(
             f"JAX_PLATFORMS={asked}: JAX finds no such device here; unset it, or install its plugin"
         ) from error
+
+
+@functools.cache
+def _ends_xla(flags: str) -> str:
+    """Why XLA ends a process of these flags, "" if it does not. One process may run several commands."""
+    start = [sys.executable, "-c", "from jaxlib import xla_client; xla_client.make_cpu_client()"]
+    given = {**os.environ, "XLA_FLAGS": flags}
+    done = subprocess.run(start, env=given, capture_output=True, text=True, errors="replace", check=False)
+    reason = done.stderr.strip().partition("\n")[0].rpartition("] ")[2]
+    return (reason or f"exit status {done.returncode}") if done.returncode else ""
 
 
 def check_numbers() -> None:
