@@ -129,11 +129,11 @@ def check_platform() -> None:
 
 
 @functools.cache
-def _ends_xla(flags: str) -> str:
+def _ends_xla(chosen: str) -> str:
     """Why XLA ends a process of these flags, "" if it does not. One process may run several commands."""
     start = [sys.executable, "-c", "from jaxlib import xla_client; xla_client.make_cpu_client()"]
-    given = {**os.environ, "XLA_FLAGS": flags}
-    done = subprocess.run(start, env=given, capture_output=True, text=True, errors="replace", check=False)
+    environment = {**os.environ, "XLA_FLAGS": chosen}
+    done = subprocess.run(start, env=environment, capture_output=True, text=True, errors="replace", check=False)
     reason = done.stderr.strip().partition("\n")[0].rpartition("] ")[2]
     return (reason or f"exit status {done.returncode}") if done.returncode else ""
 
