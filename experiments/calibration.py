@@ -17,9 +17,10 @@ import numpy as np
 
 from arm5dof.errors import UserError
 from arm5dof.runtime import files
-from arm5dof.vision.calibration.boards import Checkerboard
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
-from arm5dof.vision.calibration.intrinsics import Calibration, calibrate, fit
+from arm5dof.vision.calibration.fit import Calibration, fit
+from arm5dof.vision.calibration.intrinsics import calibrate
 from arm5dof.vision.calibration.views import BoardView, BoardViews, board_pose, find_views
 
 RESULTS = Path(__file__).parent / "results"

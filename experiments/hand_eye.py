@@ -19,7 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from arm5dof.runtime import files
-from arm5dof.vision.calibration.boards import Checkerboard, Corners
+from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.extrinsics import board_spread
 from arm5dof.vision.calibration.hand_eye import eye_in_hand
 from arm5dof.vision.calibration.views import board_pose

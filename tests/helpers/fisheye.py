@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from helpers.photographs import draw
 
-from arm5dof.vision.calibration.boards import Checkerboard
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.camera import Camera
 
 FISHEYE = Camera(

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from arm5dof.vision.calibration.boards import Charuco, Checkerboard
+from arm5dof.vision.calibration.charuco import Charuco
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.camera import Camera
 
 TRUE = Camera(

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from arm5dof.vision.calibration.boards import Checkerboard, Corners
+from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
 from arm5dof.vision.calibration.extrinsics import from_corners
-from arm5dof.vision.calibration.intrinsics import fit
+from arm5dof.vision.calibration.fit import fit
 from arm5dof.vision.calibration.views import BoardView, board_pose
 from arm5dof.vision.camera import Camera
 from arm5dof.vision.detections import Detections

@@ -29,7 +29,8 @@ def add_board(parser: argparse.ArgumentParser) -> None:
 def board(size: tuple[int, int], square: float, marker: float | None, dictionary: str | None) -> Board:
     """The board that they describe: a ChArUco board if its markers have a side. Raises `UserError` if there is none
     such."""
-    from arm5dof.vision.calibration.boards import Charuco, Checkerboard
+    from arm5dof.vision.calibration.charuco import Charuco
+    from arm5dof.vision.calibration.checkerboard import Checkerboard
 
     if marker is not None:
         return Charuco(*size, square, marker, dictionary or "DICT_5X5_100")

@@ -9,10 +9,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from arm5dof.vision.calibration.boards import Checkerboard, Corners
+from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
 from arm5dof.vision.calibration.extrinsics import from_corners
-from arm5dof.vision.calibration.intrinsics import fit
+from arm5dof.vision.calibration.fit import fit
 from arm5dof.vision.calibration.poses import pose_matrix
 from arm5dof.vision.calibration.views import BoardView, board_pose
 from arm5dof.vision.camera import Camera

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from arm5dof.vision.calibration.boards import Corners
 from arm5dof.vision.calibration.corner_noise import corner_covariance
 from arm5dof.vision.calibration.covariance import linearize, pose_covariance
-from arm5dof.vision.calibration.intrinsics import fit
+from arm5dof.vision.calibration.fit import fit
 from arm5dof.vision.calibration.views import board_pose, find_views
 
 APART = np.linalg.norm(BOARD.points[:, None] - BOARD.points[None], axis=-1) / BOARD.square

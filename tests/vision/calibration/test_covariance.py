@@ -6,7 +6,7 @@ from helpers.tabletop import HEIGHT, LENS, WIDTH, over_the_table, pose
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from arm5dof.vision.calibration.boards import Checkerboard
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.covariance import add_pose, placement_covariance
 from arm5dof.vision.calibration.intrinsics import calibrate
 from arm5dof.vision.calibration.views import find_views

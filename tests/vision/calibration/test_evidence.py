@@ -6,10 +6,11 @@ from helpers.tabletop import HEIGHT, LENS, WIDTH, corners, pose
 from scipy.spatial.transform import Rotation
 
 from arm5dof.errors import UserError
-from arm5dof.vision.calibration.boards import Checkerboard
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.covariance import add_intrinsics_covariance
 from arm5dof.vision.calibration.evidence import evidence, intrinsics_covariance, odd_views
-from arm5dof.vision.calibration.intrinsics import calibrate, fit
+from arm5dof.vision.calibration.fit import fit
+from arm5dof.vision.calibration.intrinsics import calibrate
 from arm5dof.vision.calibration.views import BoardView, BoardViews, board_pose, find_views
 
 SIZE = WIDTH, HEIGHT

@@ -6,7 +6,8 @@ import pytest
 from helpers.photographs import BOARD, CAMERA, KNOWN, TRUE, draw, hand_poses, photograph, photograph_board, poses
 
 from arm5dof.errors import UserError
-from arm5dof.vision.calibration.boards import Charuco, Checkerboard
+from arm5dof.vision.calibration.charuco import Charuco
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.extrinsics import from_board, from_hand
 
 

@@ -7,8 +7,11 @@ from helpers.photographs import TRUE, draw, photograph, poses
 
 from arm5dof.errors import UserError
 from arm5dof.vision.calibration import boards
-from arm5dof.vision.calibration.boards import Charuco, Checkerboard, Corners
-from arm5dof.vision.calibration.intrinsics import calibrate, fit, preview
+from arm5dof.vision.calibration.boards import Corners
+from arm5dof.vision.calibration.charuco import Charuco
+from arm5dof.vision.calibration.checkerboard import Checkerboard
+from arm5dof.vision.calibration.fit import fit
+from arm5dof.vision.calibration.intrinsics import calibrate, preview
 from arm5dof.vision.calibration.views import BoardView, find_views
 from arm5dof.vision.camera import Camera
 

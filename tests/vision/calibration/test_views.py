@@ -6,7 +6,8 @@ import pytest
 from helpers.photographs import vast_png
 
 from arm5dof.errors import UserError
-from arm5dof.vision.calibration.boards import BoardNotFoundError, Checkerboard
+from arm5dof.vision.calibration.boards import BoardNotFoundError
+from arm5dof.vision.calibration.checkerboard import Checkerboard
 from arm5dof.vision.calibration.views import MIN_VIEWS, find_views, read_gray
 
 BOARD = Checkerboard(9, 6, 0.025)
