@@ -12,7 +12,7 @@ from arm5dof.cli.vision import options
 from arm5dof.runtime import files
 
 if TYPE_CHECKING:
-    from arm5dof.vision.calibration.intrinsics import Calibration
+    from arm5dof.vision.calibration.fit import Calibration
     from arm5dof.vision.calibration.views import BoardViews
 
 HELP = """\
