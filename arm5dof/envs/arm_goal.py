@@ -19,22 +19,12 @@ from annotated_types import Ge, Le
 from arm5dof.arm import Arm, load_arm
 from arm5dof.arm.computed_servos import with_servos
 from arm5dof.arm.servos import Servos
+from arm5dof.envs import accuracy
 from arm5dof.envs.base import Act, Goal, Observation, State, Task
-from arm5dof.envs.episodes import corrected, settled
-from arm5dof.envs.inverse_kinematics import solve
-from arm5dof.envs.metrics import Error, Share
+from arm5dof.envs.metrics import Error
 from arm5dof.envs.physics import Physics
 from arm5dof.errors import UserError
 from arm5dof.settings import settings, static
-
-PROBES = 500
-"""Goals by which a policy is watched while it learns."""
-SPARED = 10
-"""Of so many goals one is simulated where servos are slow: to come to rest takes thousands of small steps of physics,
-and for all goals longer than training."""
-NEAR_LIMIT = 0.02
-"""Share of a joint's range."""
-AT_LIMIT = Share(f"refined with a joint within {NEAR_LIMIT:.0%} of a limit", higher_is_better=False)
 
 
 @settings
@@ -131,7 +121,8 @@ class ArmGoalEnv(Task):
         else:
             self._notes.append(
                 f"the servos bring the arm to rest {seconds:.2f} s after a move, more than a control step: the policy "
-                f"learns where they bring it, and the episode figure is measured in C MuJoCo, of one target in {SPARED}"
+                "learns where they bring it, and the episode figure is measured in C MuJoCo, of one target in "
+                f"{accuracy.SPARED}"
             )
 
     # What a goal is: for each task to say.
@@ -333,68 +324,16 @@ class ArmGoalEnv(Task):
         target = obs["privileged_state"][-len(achieved) :]
         return jnp.concatenate([self._seen(action), achieved, target, achieved - target])
 
-    # Accuracy.
+    # Accuracy: see `accuracy`.
 
     def evaluate(self, act: Act, key: jax.Array, n: int) -> dict[str, jax.Array]:
-        """Errors on `n` unseen goals, (n,) each, of three kinds:
-
-        - `one_shot`: one call of the policy: of its candidate answers the one that forward kinematics finds nearest;
-        - `refined`: the same with closed-loop target correction (`solve`);
-        - `episode`: the last step of an episode from a random pose, in the environment, corrected in its first steps by
-          the error that the arm then shows; with slow servos, of one goal in `SPARED`, in C MuJoCo, the arm at rest
-          after the `refined` answer, which is told again as often with what the joints lack. Infinite where physics
-          blew up.
-
-        By the name of the kind for the first component of the errors, followed by that of the component for others;
-        and `initial`, the errors before the first step. `at_limit` says which `refined` answers have a joint within
-        2 % of its range of a limit.
-        """
-        goal_key, pose_key = jax.random.split(key)
-        goals = jax.vmap(self.sample_goal)(jax.random.split(goal_key, n))
-        state = jax.vmap(self.start)(self.arm.sample(pose_key, (n,)), goals)
-        refined = solve(self, act, goals, self.config.refinements)
-        if self._servos:
-            told, some = jax.tree.map(lambda x: x[::SPARED], (refined.answer.q, state))
-            episode = settled(self, self._servos, told, some, self.config.refinements)
-        else:
-            episode = corrected(self, act, state, goals, self.config.refinements)
-        kinds = {
-            "one_shot": solve(self, act, goals, 0).answer.errors,
-            "refined": refined.answer.errors,
-            "episode": episode,
-            "initial": state.metrics,
-        }
-        found = {
-            kind if i == 0 else f"{kind}_{component}": errors[component]
-            for kind, errors in kinds.items()
-            for i, component in enumerate(self.components)
-        }
-        near = jnp.abs(refined.action) > 1 - 2 * NEAR_LIMIT
-        return {**found, "at_limit": (near & ~np.array(self.turns)).any(-1)}
+        return accuracy.evaluate(self, self._servos, act, key, n)
 
     def watch(self, act: Act, key: jax.Array) -> dict[str, jax.Array]:
-        """Mean errors of one answer to a few hundred goals, `policy_<component>`."""
-        goals = jax.vmap(self.sample_goal)(jax.random.split(key, PROBES))
-        return {f"policy_{name}": values.mean() for name, values in solve(self, act, goals, 0).answer.errors.items()}
+        return accuracy.watch(self, act, key)
 
     def failure(self, results: Mapping[str, Any]) -> str:
-        """See `Task`: not one goal was reached, and the errors are about those of an arm that does not move."""
-
-        def fails(kind: str) -> bool:
-            metric = self.metrics[kind]
-            assert isinstance(metric, Error)
-            still = metric.scale * results["means"]["initial"]
-            reached = results[kind]["within"][f"{metric.within[-1]:g}"]
-            return bool(reached == 0 and not metric.number(results[kind]) < still / 2)
-
-        if self.config.dynamics == "servo" and fails("episode") and not fails("one_shot"):
-            return (
-                "the policy's answers are right, but the servos do not bring the arm there: stiffen or damp them, or "
-                'choose dynamics = "kinematic"'
-            )
-        if fails("one_shot"):
-            return "the policy reaches nothing: train it for longer, or choose other step sizes"
-        return ""
+        return accuracy.failure(self, results)
 
     def _observe(self, data: Physics, goal: Goal) -> tuple[Observation, Goal]:
         """The observation, and what the end effector has reached."""

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from arm5dof.envs.arm_goal import AT_LIMIT, ArmGoalConfig, ArmGoalEnv
+from arm5dof.envs.accuracy import AT_LIMIT
+from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv
 from arm5dof.envs.base import vectors
 from arm5dof.envs.metrics import Error, Metric
 from arm5dof.envs.physics import Physics

@@ -11,7 +11,8 @@ from annotated_types import Gt
 from jax import export
 
 from arm5dof.arm import se3
-from arm5dof.envs.arm_goal import AT_LIMIT, ArmGoalConfig, ArmGoalEnv
+from arm5dof.envs.accuracy import AT_LIMIT
+from arm5dof.envs.arm_goal import ArmGoalConfig, ArmGoalEnv
 from arm5dof.envs.base import Act, vectors
 from arm5dof.envs.metrics import Error, Metric, Share
 from arm5dof.envs.physics import Physics
