@@ -65,6 +65,7 @@ class DDPG:
             raise UserError('this environment foresees no outcome of an action: choose critic_input = "state"')
         if config.critic_form != "scalar" and self.goal_env is None:
             raise UserError('this environment\'s rewards may be no distances: choose critic_form = "scalar"')
+        self.reward_unit = 1.0 if self.forward_model is None else self.forward_model.reward_unit
         self.vector = VectorEnv(env, episode_length)
         self.episode_length = episode_length
         self.num_envs = num_envs
@@ -234,7 +235,8 @@ class DDPG:
         """Lines 11 to 15 on one batch: critic (Eq. 4), actor (Eq. 5), target networks by tau. `critic_input` is what
         the critic sees of the batch's observations and actions, (batch, size), `shown` as `relabel` gives it."""
         networks = training.networks
-        target = batch.reward + jax.lax.cond(
+        unit = self.reward_unit
+        target = batch.reward / unit + jax.lax.cond(
             config.discount > 0, lambda: self._bootstrap(config, networks, batch), lambda: jnp.zeros_like(batch.reward)
         )
 
@@ -274,7 +276,7 @@ class DDPG:
             critic_optimizer=critic_optimizer,
             updates=training.updates + 1,
         )
-        return training, {"critic_loss": loss, "q": q}
+        return training, {"critic_loss": unit**2 * loss, "q": unit * q}
 
     def _bootstrap(self, config: DDPGConfig, networks: Networks, batch: Transition) -> jax.Array:
         """gamma Q'(s', mu'(s')), nothing beyond a terminal state."""

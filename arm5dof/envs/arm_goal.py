@@ -301,6 +301,11 @@ class ArmGoalEnv(Task):
         return self.config.restarts
 
     @property
+    def reward_unit(self) -> float:
+        """See `ForwardModel`: the arm's reach."""
+        return float(self.arm.reach)
+
+    @property
     def workspace(self) -> str:
         origin = ", ".join(f"{v:g}" for v in self.arm.origin)
         return f"the arm reaches {self.arm.measured_reach:.3f} m from ({origin}) m"

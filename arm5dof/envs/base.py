@@ -247,6 +247,12 @@ class ForwardModel(GoalEnv, Protocol):
         ...
 
     @property
+    def reward_unit(self) -> float:
+        """How far goals lie apart, in terms of rewards: what the agent measures rewards in while it learns, so that
+        one recipe serves robots of any size."""
+        ...
+
+    @property
     def workspace(self) -> str:
         """What can be reached, in words."""
         ...

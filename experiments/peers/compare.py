@@ -32,7 +32,7 @@ HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"
 CURVES = RESULTS / "peers"
 
-STATE = ["critic_input=state", "critic_width=128", "critic_depth=3"]
+STATE = ["critic_input=state", "critic_form=distance", "critic_lr=3e-3", "critic_width=128", "critic_depth=3"]
 """A critic that sees joint angles and action, no more than the peers' do: it has to learn the arm's kinematics."""
 OURS = {
     "ours-cold": [],
