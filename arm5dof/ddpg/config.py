@@ -16,8 +16,8 @@ Depth = Annotated[int, Ge(1), Le(100)]
 
 @settings
 class DDPGConfig:
-    """The agent. Defaults are for ordinary control; what suits a task better stands in the task's TOML. A unit of reward
-    is the task's, or where it has a forward model that model's `reward_unit`: an arm's reach."""
+    """The agent. Defaults are for ordinary control; what suits a task better stands in the task's TOML. Units of
+    reward are the task's, or where it has a forward model that model's `reward_unit`: an arm's reach."""
 
     actor_lr: Positive = 1e-3
     """The optimizer's step size for the actor at the start of training."""
