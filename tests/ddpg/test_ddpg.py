@@ -6,10 +6,12 @@ import functools
 from collections import deque
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import optax
 import pytest
@@ -934,3 +936,23 @@ def test_hindsight_recomputes_reward_and_terminal_and_draws_later_goals():
         after = [row + 4 * k for k in range(12) if row + 4 * k < int(replay.size)]
         mine = [r for r in after if steps[r] == steps[row] + (r - row) // 4]
         assert np.abs(places[mine] - wanted).min() == 0
+
+
+def test_arms_of_any_size_are_learnt_alike():
+    """Four times as large, a power of two, the paper's arm trains the same networks to the last bit."""
+
+    def train(size: float) -> tuple[Training, dict[str, jax.Array]]:
+        spec = mujoco.MjSpec.from_file(str(Path(__file__).parents[2] / "mjcf" / "reach.xml"))
+        for part in (*spec.bodies, *spec.sites):
+            part.pos = size * part.pos
+        env = Reach(ReachConfig(dynamics="kinematic"), load_arm(spec.compile()))
+        config = replace(load_config("kinematic.toml").ddpg, actor_width=16, actor_depth=2, updates_per_step=8)
+        agent = DDPG(env, config, num_envs=32, episode_length=160, total_steps=10)
+        assert agent.reward_unit == pytest.approx(size * 0.268, abs=size * 1e-3)
+        training = quick_jit(agent.init)(config, jax.random.key(0))
+        return quick_jit(agent.epoch, static_argnames="steps")(config, training, steps=10)
+
+    (one, metrics), (other, larger) = train(1), train(4)
+    assert_same_bits(one.networks, other.networks)
+    for name in ("reward", "q", "distance"):
+        assert float(larger[name]) == pytest.approx(4 * float(metrics[name]), rel=1e-6), name
