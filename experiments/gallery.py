@@ -16,6 +16,7 @@ import platform
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,19 +60,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--models", type=Path, nargs="+", default=None)
     parser.add_argument("--only", nargs="+", choices=ARMS, default=list(ARMS))
+    parser.add_argument("--at-once", type=int, default=1, metavar="N", help="train so many at a time; default 1")
     arguments = parser.parse_args()
     roots = arguments.models or menagerie()
-    rows, pictures = [], []
+    files_of = {}
     for name in arguments.only:
         public = ARMS[name]
         found = [root / public.file for root in roots if (root / public.file).is_file()]
-        if not found:
+        if found:
+            files_of[name] = found[0]
+        else:
             print(f"{public.title}: skipped, {public.file} is not in {' or '.join(map(str, roots)) or 'any folder'}")
-            continue
-        rows.append(measure(public, train(name, public, found[0])))
-        pictures.append(picture(name, public, found[0]))
+    rows, pictures = [], []
+    with ThreadPoolExecutor(arguments.at_once) as pool:
+        trained = {name: pool.submit(train, name, ARMS[name], file) for name, file in files_of.items()}
+        for name, training in trained.items():
+            print(f"{ARMS[name].title}: {training.result()}", flush=True)
+    for name, file in files_of.items():  # When nothing is timed any more.
+        rows.append(measure(ARMS[name], OUT / name))
+        pictures.append(picture(name, ARMS[name], file))
         print(rows[-1], flush=True)
-    text = markdown(rows)
+    text = markdown(rows, arguments.at_once)
     print(text)
     if arguments.only == list(ARMS) and rows:
         files.write_text(HERE / "results" / "gallery.md", text)
@@ -163,7 +172,7 @@ def montage(pictures: list[np.ndarray], columns: int = 5) -> np.ndarray:
     return np.vstack([np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)])
 
 
-def markdown(rows: list[list[str]]) -> str:
+def markdown(rows: list[list[str]], at_once: int) -> str:
     header = [
         *("arm", "joints", "one answer: median, <= 10 mm", "corrected: <= 1 mm", "servos: <= 5 mm, <= 1 mm"),
         *("near a limit (uniform poses)", "apart from C MuJoCo, at most", "train and evaluate"),
@@ -174,6 +183,7 @@ def markdown(rows: list[list[str]]) -> str:
         f"Command: `python experiments/gallery.py --models DIR`. {platform.machine()} CPU, {xla.cores()} cores. Each",
         "was trained by `arm5dof train --arm FILE`: 400 episodes, one seed, 10,000 unseen targets. Near a limit:",
         "corrected answers with a joint within 2 % of its range of a limit, and in brackets uniform poses.",
+        f"The times are those of {at_once} trainings at once." if at_once > 1 else "One was trained after the other.",
         "",
         "| " + " | ".join(header) + " |",
         "| --- |" + " ---: |" * (len(header) - 1),
