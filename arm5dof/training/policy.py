@@ -164,7 +164,7 @@ class Policy(struct.PyTreeNode, eq=False):
         """Answers to a line of goals that lie near each other, without a jump of a joint where there is such a way.
 
         One branch of the actor is kept where one serves. Where none does, lines of damped least squares that begin at
-        the answers to the first and to the last goal are candidates too.
+        the answers to the first and to the last goal, those of `solve` among them, are candidates too.
 
         Args:
             target: As for `solve`, (n, 3).
@@ -186,7 +186,9 @@ class Policy(struct.PyTreeNode, eq=False):
         begin = None if start is None else self._pose("start", start, 1)[0]
         best = self._path(found, begin)
         if best.jumps.any() or not self._met(best).all():
-            more = _lines(self.forward_model, goals, found.action[:, [0, -1]])
+            ends = _solve(self, jax.tree.map(lambda x: x[np.array([0, -1])], goals), corrections=max(corrections, 1))
+            starts = jnp.concatenate([found.action[:, [0, -1]], ends.action[None]])
+            more = _lines(self.forward_model, goals, starts)
             best = self._path(jax.tree.map(lambda *parts: jnp.concatenate(parts), found, more), begin)
         return best
 
