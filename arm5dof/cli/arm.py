@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.arm import Arm
@@ -49,6 +48,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
         writable(args.figure, (".png",))
     from arm5dof.arm import load_arm
+    from arm5dof.runtime import files
 
     arm = load_arm(args.file, args.site, args.base)
     if not args.json:

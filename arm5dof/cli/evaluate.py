@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from arm5dof.cli.parser import natural, nothing_left, positive
-from arm5dof.runtime import files
 
 HELP = """\
 Measure a policy on targets that it has never seen, or on episodes where its task has no targets.
@@ -29,6 +28,7 @@ def declare(commands: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace, rest: list[str]) -> None:
     """`arm5dof eval`."""
     nothing_left(rest, "eval")
+    from arm5dof.runtime import files
     from arm5dof.runtime.progress import Bar
     from arm5dof.training.evaluate import tables
     from arm5dof.training.run import Run

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from arm5dof.cli.joints import by_unit, for_people
 from arm5dof.cli.parser import natural, nothing_left, positive
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.grasp.evaluation import Program
@@ -93,6 +92,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> int:
         return _photograph(args, policy, radii)
     from arm5dof.grasp.evaluation import Program, Setting, evaluate
     from arm5dof.grasp.score import Score, table
+    from arm5dof.runtime import files
     from arm5dof.runtime.progress import Bar
 
     place = tuple(args.place) if args.place else None
@@ -129,6 +129,7 @@ def _watched(program: Program, video: Path | None, quiet: bool) -> Trial:
     if video is None:
         return program.trial(0, lambda *_: Teller())
     from arm5dof.grasp.video import Recorder
+    from arm5dof.runtime import files
 
     with files.replacing(video) as temporary:
         recorders: list[Recorder] = []
@@ -154,6 +155,7 @@ def _photograph(args: argparse.Namespace, policy: Path, radii: tuple[float, floa
     from arm5dof.grasp.planner import Planner
     from arm5dof.grasp.robot import DryRun
     from arm5dof.grasp.world import World
+    from arm5dof.runtime import files
     from arm5dof.training.policy_file import load_policy
     from arm5dof.vision import images
     from arm5dof.vision.camera import Camera

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from arm5dof.cli.joints import by_unit
 from arm5dof.cli.parser import Parser, natural, nothing_left
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.envs import ForwardModel
@@ -78,6 +77,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.path and args.all:
         raise UserError("--path wants one answer to each target: leave out --all")
 
+    from arm5dof.runtime import files
     from arm5dof.training.policy import forward_model
     from arm5dof.training.run import Run
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import options
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.vision.calibration.fit import Calibration
@@ -61,6 +60,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     if args.preview is not None:
         options.writable(args.preview, (".png", ".jpg"))
 
+    from arm5dof.runtime import files
     from arm5dof.runtime.progress import late_bar
     from arm5dof.vision.calibration.intrinsics import calibrate, preview
     from arm5dof.vision.calibration.views import find_views, image_names

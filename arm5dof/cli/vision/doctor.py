@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -54,6 +53,8 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
 
 def _broken_choice() -> str | None:
     """What MUJOCO_GL says if that keeps MuJoCo from being imported; it is then forgotten, so that we can go on."""
+    import subprocess
+
     if "MUJOCO_GL" not in os.environ:
         return None
     tried = subprocess.run([sys.executable, "-c", "import mujoco"], capture_output=True, check=False)

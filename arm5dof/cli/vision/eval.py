@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.vision.evaluation.detection import Result
@@ -48,6 +47,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
         if getattr(args, name) < least:
             raise UserError(f"--{name} is {least} or more, not {getattr(args, name)}")
 
+    from arm5dof.runtime import files
     from arm5dof.runtime.progress import Bar
     from arm5dof.vision.evaluation.detection import evaluate
 

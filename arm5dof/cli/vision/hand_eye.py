@@ -8,7 +8,6 @@ from pathlib import Path
 
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
-from arm5dof.runtime import files
 
 HELP = """\
 Find where a camera stands, or sits on the hand, from photographs of a board and the hand's poses.
@@ -55,6 +54,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     nothing_left(rest, "vision hand-eye")
     options.writable(args.out, (".yml", ".yaml"))
 
+    from arm5dof.runtime import files
     from arm5dof.runtime.progress import late_bar
     from arm5dof.vision.calibration.extrinsics import from_hand
     from arm5dof.vision.calibration.poses import read_hand_poses

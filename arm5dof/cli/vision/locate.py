@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import detecting, options, placing
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     from arm5dof.vision.detections import Detections
@@ -189,6 +188,7 @@ def _run_on_lists(args: argparse.Namespace) -> int:
     if needless := detecting.given(args):
         raise UserError(f"leave out {', '.join(needless)}: that takes images, and DETECTIONS.json has none")
 
+    from arm5dof.runtime import files
     from arm5dof.runtime.progress import Bar
     from arm5dof.vision.io import localizations
 

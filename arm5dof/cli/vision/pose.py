@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from arm5dof.cli.parser import nothing_left
 from arm5dof.cli.vision import camera_report, options
 from arm5dof.errors import UserError
-from arm5dof.runtime import files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -61,6 +60,7 @@ def run(args: argparse.Namespace, rest: list[str]) -> None:
     options.writable(args.out, (".yml", ".yaml"))
     board_to_base, placement_std = _at(args.at), _placed(args.placed)
 
+    from arm5dof.runtime import files
     from arm5dof.vision.calibration.extrinsics import from_board
     from arm5dof.vision.camera import Camera
 
