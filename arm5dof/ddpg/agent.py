@@ -250,7 +250,9 @@ class DDPG:
             judged = jnp.concatenate([actions, shown[:, None]], axis=1) if imitate else actions
             q = self.value(config, critic, batch.obs, judged)
             cost = config.limit_weight * losses.limit_cost(actions)
-            loss = losses.actor_loss(q[:, : self.actor.heads], batch.weight, config.head_temperature, cost)
+            loss = losses.actor_loss(
+                q[:, : self.actor.heads], batch.weight, config.head_temperature, cost, config.actor_error_weight
+            )
             if imitate:
                 imitation = losses.imitation_loss(actions, q, shown, batch.weight, config.imitation_margin)
                 loss += config.imitation_weight * imitation

@@ -55,6 +55,9 @@ class DDPGConfig:
     """An error of the critic at a target value v counts 1 / (1 + critic_error_weight |v|) times; 1 / units of reward.
     Where rewards are minus a distance the actor learns the last millimetres from values near a goal. 0: all count
     alike."""
+    actor_error_weight: Annotated[float, Ge(0)] = 0.0
+    """An observation whose best candidate has the value v counts 1 + actor_error_weight |v| times for the actor; 1 /
+    units of reward. Where rewards are minus a distance this is for goals that are few and hard. 0: all count alike."""
     limit_weight: Annotated[float, Ge(0)] = 0.0
     """What an action near its limits, -1 or 1, costs the actor, in units of reward: so much at the limit, and nothing
     inside `losses.FREE`. Where several actions are as good, those in the middle are learnt."""

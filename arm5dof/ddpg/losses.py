@@ -20,14 +20,19 @@ FREE = 0.9
 
 
 def actor_loss(
-    q: jax.Array, weight: jax.Array, temperature: jax.Array | float, cost: jax.Array | float = 0.0
+    q: jax.Array,
+    weight: jax.Array,
+    temperature: jax.Array | float,
+    cost: jax.Array | float = 0.0,
+    focus: jax.Array | float = 0.0,
 ) -> jax.Array:
     """Eq. 5: minus the critic's opinion of the actor's actions; its gradient is grad_a Q grad_theta mu.
 
     `q` is (batch, heads). Each sample teaches its heads in proportion to softmax(Q / temperature), so that heads
-    divide the targets among them. With one head this is the paper's loss, and `cost` is what actions cost besides.
+    divide the targets among them, and counts 1 + focus |Q| times by the Q of the best. With one head and no focus this
+    is the paper's loss; `cost` is what actions cost besides.
     """
-    share = jax.lax.stop_gradient(jax.nn.softmax(q / temperature, axis=-1))
+    share = jax.lax.stop_gradient(jax.nn.softmax(q / temperature, axis=-1) * (1 + focus * jnp.abs(q.max(-1))[:, None]))
     return -_mean((share * (q - cost)).sum(-1), weight)
 
 

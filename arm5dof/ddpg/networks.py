@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +45,9 @@ class Actor(nn.Module):
     """mu(s): observations (..., state) to `heads` candidate actions (..., heads, action_size) in [-1, 1].
 
     A single continuous map from targets to joint angles must tear somewhere: several heads can cover it in pieces.
-    They start from different random constants. With `products` the network sees, beside the observation, the product
-    of every pair of its components: lengths, moments and angles between directions are sums of these.
+    They start from random constants all over the actions, so as to differ in branch. With `products` the network sees,
+    beside the observation, the product of every pair of its components: lengths, moments and angles between directions
+    are sums of these.
     """
 
     action_size: int
@@ -61,9 +63,14 @@ class Actor(nn.Module):
         if self.products:
             i, j = jnp.triu_indices(obs.shape[-1])
             obs = jnp.concatenate([obs, obs[..., i] * obs[..., j]], axis=-1)
-        spread = nn.initializers.normal(0.5) if self.heads > 1 else nn.initializers.zeros_init()
+        spread = _all_over if self.heads > 1 else nn.initializers.zeros_init()
         x = MLP(self.width, self.depth, self.heads * self.action_size, self.activation, self.layer_norm, spread)(obs)
         return jnp.tanh(x).reshape(*obs.shape[:-1], self.heads, self.action_size)
+
+
+def _all_over(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> jax.Array:
+    """Biases for which tanh is uniform, but for the limits, where it has no slope."""
+    return jnp.arctanh(jax.random.uniform(key, shape, dtype, -0.95, 0.95))
 
 
 class Critic(nn.Module):

@@ -229,6 +229,14 @@ def test_heads_share_a_target_by_softmax():
     np.testing.assert_allclose(gradient, -share / 50, atol=1e-6)
 
 
+def test_goals_that_are_hard_count_more():
+    q, temperature = -np.random.default_rng(0).uniform(size=(50, 4)), 0.7
+    share = np.exp(q / temperature) / np.exp(q / temperature).sum(1, keepdims=True)
+    gradient = jax.grad(losses.actor_loss)(jnp.array(q), jnp.ones(50), temperature, focus=30.0)
+    hard = 1 + 30 * np.abs(q).min(1, keepdims=True)  # How far the best head is off.
+    np.testing.assert_allclose(gradient, -share * hard / 50, rtol=1e-5)
+
+
 def test_actions_cost_at_their_limits_alone():
     actions = jnp.array([[0.0, 0.9, -0.5], [0.95, 0.0, 0.0], [1.0, -1.0, 0.3]])
     np.testing.assert_allclose(losses.limit_cost(actions), [0.0, 0.25, 2.0], atol=1e-6)
@@ -540,6 +548,12 @@ def test_an_actor_may_see_products():
     seen = np.stack([a, b, c, a * a, a * b, a * c, b * b, b * c, c * c], -1)
     params = products.init(jax.random.key(0), obs)
     np.testing.assert_allclose(products.apply(params, obs), plain.apply(params, seen), atol=1e-6)
+
+
+def test_heads_start_all_over_the_actions():
+    actor = Actor(2, heads=500, products=False, width=8, depth=2, activation="gelu", layer_norm=False)
+    actions = actor.apply(actor.init(jax.random.key(0), jnp.zeros(3)), jnp.zeros(3))
+    assert kstest(np.ravel(actions), "uniform", args=(-0.95, 1.9)).pvalue > 0.01
 
 
 def test_gelu_is_about_gelu():
