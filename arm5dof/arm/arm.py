@@ -14,6 +14,7 @@ import numpy as np
 
 from arm5dof.arm.actuators import actuation
 from arm5dof.arm.chain import Link, joint_name
+from arm5dof.arm.trigonometry import cos_sin
 from arm5dof.arm.workspace import measure_reach
 from arm5dof.errors import UserError
 from arm5dof.runtime.tables import Table
@@ -181,7 +182,7 @@ class Arm:
         # The gradient of a split is one concatenation, that of indexing a sum of padded arrays.
         q = jnp.asarray(q)
         split = lambda x: [v[..., 0] for v in jax.lax.split(x, (1,) * self.dof, axis=x.ndim - 1)]
-        return [split(x) for x in (q, *_cos_sin(q))]
+        return [split(x) for x in (q, *cos_sin(q))]
 
     def _point(self, joints: Joints, behind: int) -> jax.Array:
         """The point behind the first so many joints, (..., 3).
@@ -264,20 +265,6 @@ class Arm:
 
     def _repr_html_(self) -> str:
         return self.table().html()
-
-
-@jax.custom_jvp
-def _cos_sin(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Computed once, and kept for the gradient: XLA would do it again for every term that they appear in."""
-    return jax.lax.optimization_barrier((jnp.cos(q), jnp.sin(q)))
-
-
-@_cos_sin.defjvp
-def _cos_sin_jvp(
-    primals: tuple[jax.Array], tangents: tuple[jax.Array]
-) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    cosine, sine = _cos_sin(*primals)
-    return (cosine, sine), (-sine * tangents[0], cosine * tangents[0])
 
 
 def _row(rotation: np.ndarray, offset: float, point: tuple[jax.Array, ...]) -> jax.Array:
