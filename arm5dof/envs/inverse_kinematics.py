@@ -54,8 +54,14 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candida
         found = candidates(env, act, goals, corrections, env.branches)
         best = found.reward.argmax(0)
         return nearest(env, act, goals, jax.tree.map(lambda x: x[best, jnp.arange(len(best))], found))
-    actions, rewards = _answers(env, act, goals)
-    return _judge(env, goals, actions[jnp.arange(len(actions)), rewards.argmax(1)])
+    actions = act.answers(jax.vmap(env.question)(goals)).swapaxes(0, 1)
+
+    def better(best: Candidate, action: jax.Array) -> tuple[Candidate, None]:
+        other = _judge(env, goals, action)
+        return choose(other.reward > best.reward, other, best), None
+
+    # Branch after branch XLA makes one loop of this, with an axis of branches several, which take twice as long.
+    return jax.lax.scan(better, _judge(env, goals, actions[0]), actions[1:])[0]
 
 
 def candidates(env: ForwardModel, act: Act, goals: Goal, corrections: int, branches: int | None = None) -> Candidate:

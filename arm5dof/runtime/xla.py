@@ -9,13 +9,17 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from arm5dof.errors import UserError
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 FUSION_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
 """Worth 4 to 8 times in `mjx.step` on a CPU; it concerns no other back end."""
@@ -60,6 +64,24 @@ def fusion_emitters() -> dict[str, bool]:
 
     known = jax.default_backend() == "cpu" and _known(metadata.version("jaxlib"))
     return {"xla_cpu_use_fusion_emitters": True} if known else {}
+
+
+ONE_CORE = {"xla_cpu_multi_thread_eigen": False}
+"""`compiler_options` of a program for a CPU that is to stay on one core: see `on_all_cores`."""
+
+
+def on_all_cores(function: Callable[[T], U], items: Iterable[T]) -> list[U]:
+    """The function of each of some items, one or more, so many at a time as this process has cores: of the programs
+    that one thread asks for XLA runs one after the other, and most of each on one core."""
+    import jax
+
+    first, *others = items
+    found = [function(first)]  # Alone, so that it is traced and compiled once.
+    pool = ThreadPoolExecutor(cores())
+    try:
+        return found + list(pool.map(lambda item: jax.block_until_ready(function(item)), others))
+    finally:
+        pool.shutdown(cancel_futures=True)  # What has not begun when this is interrupted.
 
 
 @contextmanager

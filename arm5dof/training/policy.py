@@ -23,6 +23,9 @@ from arm5dof.training.policy_program import of_policy
 AT_ONCE = 4_096
 """Goals in one device call: more take memory, and on a CPU, beyond its caches, more time each."""
 
+BLOCK = 512
+"""Goals that a core of a CPU answers at a time where there are more than `AT_ONCE`: they stay in its cache."""
+
 MOST_CORRECTIONS = 10_000
 
 
@@ -114,12 +117,18 @@ class Policy(struct.PyTreeNode, eq=False):
         if n <= AT_ONCE:
             answer = self._answer(goals, corrections, poses, candidates)
             return jax.tree.map(lambda x: x[0], answer) if single else answer
-        parts, goals = [], jax.tree.map(np.asarray, goals)
-        for first in range(0, n, AT_ONCE):
+        goals = jax.tree.map(np.asarray, goals)
+
+        def part(first: int) -> Answer:
             # All are of one size, since another would be another program: the last begins again at the first goal.
             rows = np.arange(first, first + AT_ONCE) % n
-            some = jax.tree.map(lambda x: x[rows], goals)  # noqa: B023
-            parts.append(self._answer(some, corrections, None if poses is None else poses[rows], candidates))
+            some = jax.tree.map(lambda x: x[rows], goals)
+            if one_shot:
+                return _solve_in_blocks(self, some).answer
+            return self._answer(some, corrections, None if poses is None else poses[rows], candidates)
+
+        one_shot = not (corrections or candidates) and near is None and jax.default_backend() == "cpu"
+        parts = (xla.on_all_cores if one_shot else map)(part, range(0, n, AT_ONCE))
         return jax.tree.map(lambda *xs: jnp.concatenate(xs)[:n], *parts)
 
     def _answer(self, goals: Goal, corrections: int, near: np.ndarray | None, candidates: bool) -> Answer:
@@ -268,6 +277,13 @@ def forward_model(env: Task) -> ForwardModel:
 @of_policy(xla.fusion_emitters)  # Networks and no physics: the emitters make them twice as fast.
 def _solve(policy: Policy, goals: Goal, corrections: int) -> Candidate:
     return inverse_kinematics.solve(policy.forward_model, policy, goals, corrections)
+
+
+@of_policy(lambda: xla.fusion_emitters() | xla.ONE_CORE)
+def _solve_in_blocks(policy: Policy, goals: Goal) -> Candidate:
+    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), goals)
+    found = jax.lax.map(lambda some: inverse_kinematics.solve(policy.forward_model, policy, some, 0), blocks)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
 
 @of_policy(xla.fusion_emitters)

@@ -21,7 +21,7 @@ from arm5dof.envs.reach_pose import ReachPose, ReachPoseConfig
 from arm5dof.grasp.shipped import shipped
 from arm5dof.settings import settings, static
 from arm5dof.training.config import load_config
-from arm5dof.training.policy import Policy
+from arm5dof.training.policy import AT_ONCE, Policy
 from arm5dof.training.policy_file import load_policy
 
 SMALL = load_config("kinematic.toml", actor_width=16, actor_depth=1, critic_width=8, critic_depth=1, heads=3).ddpg
@@ -85,6 +85,16 @@ def test_one_goal_is_answered_as_the_first_of_many(policy: Policy):
 )
 def test_what_is_no_target_is_told_what_one_is(policy: Policy, target):
     assert said(lambda: policy.solve(target)).startswith("target takes 3 numbers (x, y, z), or rows of them, not ")
+
+
+def test_many_goals_are_answered_as_few(policy: Policy):
+    """In blocks, on all cores."""
+    goals = np.asarray(policy.env.arm.forward(policy.env.arm.sample(jax.random.key(0), (2 * AT_ONCE + 7,))))
+    few = np.r_[0:20, AT_ONCE - 10 : AT_ONCE + 10, -20:0]
+    expected, found = policy.solve(goals[few]), policy.solve(goals)
+    for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        assert len(other) == len(goals)
+        np.testing.assert_allclose(np.asarray(other)[few], one, atol=1e-5)
 
 
 def test_solve_says_what_it_takes(policy: Policy):
