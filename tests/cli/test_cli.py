@@ -29,7 +29,7 @@ from arm5dof.training.run import Run, free_folder
 
 TINY = (
     "kinematic.toml --episodes 4 --num-envs 2 --evaluate-every 2 --checkpoint-every 2 --episode-length 32 "
-    "--batch-size 32 --actor-width 16 --heads 2 --updates-per-step 2 --targets 100 --interim-targets 100 "
+    "--batch-size 32 --actor-width 16 --heads 2 --updates-per-step 16 --targets 100 --interim-targets 100 "
     "--replay-capacity 1024"
 )
 
