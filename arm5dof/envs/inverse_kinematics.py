@@ -60,7 +60,7 @@ def solve(env: ForwardModel, act: Act, goals: Goal, corrections: int) -> Candida
         other = _judge(env, goals, action)
         return choose(other.reward > best.reward, other, best), None
 
-    # Branch after branch XLA makes one loop of this, with an axis of branches several, which take twice as long.
+    # Branch after branch, so that what XLA makes of them stays in a cache.
     return jax.lax.scan(better, _judge(env, goals, actions[0]), actions[1:])[0]
 
 
